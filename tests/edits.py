@@ -39,28 +39,24 @@ def _texture(rng: random.Random, kind: str) -> dict[str, Any]:
 
 
 def _material(rng: random.Random) -> dict[str, Any]:
-    ours = {
-        "type": "mrt_bsdf",
-        "alpha": rng.uniform(0.05, 0.5),
-        "int_ior": rng.choice([0.5, 1.3, 2.0]),
-        "fresnel": rng.choice(["schlick", "dielectric", "unity"]),
-        "diffuse_reflectance": rng.choice([_color(rng), _texture(rng, "mrt_texture")]),
-        "specular_reflectance": rng.choice([_color(rng), 0.0]),
-    }
+    ours: dict[str, Any] = {"type": "mrt_bsdf", "alpha": rng.uniform(0.05, 0.5)}
+    ours["int_ior"] = rng.choice([0.5, 1.3, 2.0])
+    ours["fresnel"] = rng.choice(["schlick", "dielectric", "unity"])
+    ours["diffuse_reflectance"] = rng.choice([_color(rng), _texture(rng, "mrt_texture")])
+    ours["specular_reflectance"] = rng.choice([_color(rng), 0.0])
     matte = {"type": "diffuse"}
-    stock = [
-        {"type": "diffuse", "reflectance": rng.choice([_color(rng), _texture(rng, "bitmap")])},
-        {"type": "roughconductor", "alpha": rng.uniform(0.1, 0.5)},
-        {"type": "twosided", "nested": {"type": "plastic", "diffuse_reflectance": _color(rng)}},
-        {"type": "conductor"},
-        {"type": "roughplastic", "alpha": rng.uniform(0.1, 0.5)},
-        {"type": "principled", "roughness": rng.uniform(0.2, 0.8), "metallic": rng.uniform(0, 1)},
-        {"type": "blendbsdf", "weight": rng.uniform(0, 1), "a": matte, "b": {"type": "conductor"}},
-        {"type": "mask", "opacity": rng.uniform(0, 1), "nested": matte},
-        {"type": "bumpmap", "bump": _texture(rng, "bitmap"), "nested": matte},
-        {"type": "normalmap", "normalmap": _texture(rng, "bitmap"), "nested": matte},
-        {"type": "dielectric"},
-    ]
+    metal = {"type": "conductor"}
+    stock: list[dict[str, Any]] = []
+    stock += [{"type": "diffuse", "reflectance": rng.choice([_color(rng), _texture(rng, "bitmap")])}]
+    stock += [{"type": "roughconductor", "alpha": rng.uniform(0.1, 0.5)}]
+    stock += [{"type": "twosided", "nested": {"type": "plastic", "diffuse_reflectance": _color(rng)}}]
+    stock += [metal, {"type": "roughplastic", "alpha": rng.uniform(0.1, 0.5)}]
+    stock += [{"type": "principled", "roughness": rng.uniform(0.2, 0.8), "metallic": rng.uniform(0, 1)}]
+    stock += [{"type": "blendbsdf", "weight": rng.uniform(0, 1), "a": matte, "b": metal}]
+    stock += [{"type": "mask", "opacity": rng.uniform(0, 1), "nested": matte}]
+    stock += [{"type": "bumpmap", "bump": _texture(rng, "bitmap"), "nested": matte}]
+    stock += [{"type": "normalmap", "normalmap": _texture(rng, "bitmap"), "nested": matte}]
+    stock += [{"type": "dielectric"}]
     return ours if rng.random() < 0.6 else rng.choice(stock)
 
 
@@ -85,7 +81,8 @@ def _shape(rng: random.Random) -> dict[str, Any]:
         ends = {"mrt_cone": ("apex", "base_center"), "mrt_cylinder": ("p0", "p1")}[kind]
         form = {ends[0]: [0, 1, 0], ends[1]: [0, 0, 0], "radius": 0.5, "segments": 16}
     if kind == "sdfgrid":
-        grid = np.linalg.norm(np.indices((6, 6, 6)) - 2.5, axis=0)[..., None] / 5 - rng.uniform(0.2, 0.4)
+        distance = np.linalg.norm(np.indices((6, 6, 6)) - 2.5, axis=0)
+        grid = distance[..., None] / 5 - rng.uniform(0.2, 0.4)
         form = {"grid": mi.TensorXf(grid.astype(np.float32))}
     return {"type": kind, **form, "to_world": _place(rng)}
 
@@ -114,15 +111,13 @@ def scene_of(rng: random.Random) -> dict[str, Any]:
     sky = {"type": "constant", "radiance": _color(rng)}
     if rng.random() < 0.5:
         sky = {"type": "envmap", "bitmap": _texture(rng, "bitmap")["bitmap"]}
-    more = [
-        {"type": "point", "position": [-2, 3, 2], "intensity": _color(rng)},
-        {"type": "directional", "direction": [0, -1, -0.3], "irradiance": _color(rng)},
-        {"type": "spot", "to_world": view["to_world"], "intensity": _color(rng)},
-        {"type": "projector", "to_world": view["to_world"], "irradiance": _texture(rng, "bitmap")},
-        sky,
-        {"type": "sphere", "center": [0, 3, 0], "radius": 0.2,
-         "emitter": {"type": "area", "radiance": _color(rng)}},
-    ]  # fmt: skip
+    more: list[dict[str, Any]] = []
+    more += [{"type": "point", "position": [-2, 3, 2], "intensity": _color(rng)}]
+    more += [{"type": "directional", "direction": [0, -1, -0.3], "irradiance": _color(rng)}]
+    more += [{"type": "spot", "to_world": view["to_world"], "intensity": _color(rng)}]
+    more += [{"type": "projector", "to_world": view["to_world"], "irradiance": _texture(rng, "bitmap")}, sky]
+    glow = {"type": "area", "radiance": _color(rng)}
+    more += [{"type": "sphere", "center": [0, 3, 0], "radius": 0.2, "emitter": glow}]
     scene |= {f"l{i}": light for i, light in enumerate(rng.sample(more, rng.randint(0, 2)))}
     return scene
 
@@ -229,5 +224,7 @@ def anew(content: dict[str, Any], edits: list[Edit]) -> Iterator[np.ndarray]:
 if __name__ == "__main__":
     mi.set_variant("llvm_ad_rgb")
     mrt.register()
-    first, count, path = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+    first = int(sys.argv[1])
+    count = int(sys.argv[2])
+    path = sys.argv[3]
     np.savez(path, **{str(n): list(anew(content, edits)) for n, content, edits in stories(first, count)})

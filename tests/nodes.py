@@ -8,6 +8,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba.plugins.table import Plugin
+
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
 SENSOR = "<sensor type='perspective'><film type='hdrfilm'>{}</film></sensor>"
 SMALL = SENSOR.format("<integer name='width' value='4'/><integer name='height' value='3'/>")
@@ -44,3 +46,9 @@ def sensor(
     look = mi.ScalarTransform4f().look_at(list(origin), list(target), list(up))
     film = {"type": "hdrfilm", "width": size[0], "height": size[1], "component_format": "float32"}
     return {"type": "perspective", "to_world": look, "film": {**film, "rfilter": {"type": rfilter}}, **more}
+
+
+def example(row: Plugin, **more: Any) -> dict[str, Any]:
+    """A plugin of the table with the parameters of its sample."""
+    values = {k: mi.Bitmap(v) if isinstance(v, np.ndarray) else v for k, v in row.sample.items()}
+    return {"type": row.name, **values, **more}

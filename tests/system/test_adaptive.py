@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from itertools import product
+from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
+from nodes import sensor
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.rendering.progress import Progress
@@ -22,7 +26,8 @@ SIZES = [(1, 1), (2, 2), (1, 7), (7, 1), (3, 3), (5, 2), (37, 23)]
 def test_any_size_renders(width, height, aamode):
     for dof in ("report", "corrected")[: 2 if aamode == "none" else 1]:
         result = mrt.render(3, width=width, height=height, aa=2, aamode=aamode, dof=dof)
-        assert result.image.shape == (height, width, 3) and np.isfinite(result.image).all()
+        assert result.image.shape == (height, width, 3)
+        assert np.isfinite(result.image).all()
         if aamode != "none":
             refined = result.layers["samples.Y"] > 1
             assert result.rays["primary"] == width * height + refined.sum() * 3
@@ -39,7 +44,7 @@ def test_any_amount_refines_to_full_supersampling(aa, lattice):
     adaptive = mrt.render(1, **options, aamode="sobel")
     assert full.rays["primary"] == 33 * 21 * aa**2
     if aa == 1:
-        np.testing.assert_array_equal(adaptive.image, full.image)
+        assert_array_equal(adaptive.image, full.image)
         return
     refined = adaptive.layers["samples.Y"] > 1
     assert 0 < refined.sum() < refined.size
@@ -47,9 +52,9 @@ def test_any_amount_refines_to_full_supersampling(aa, lattice):
     further = aa**2 - 1 if lattice == "report" or aa % 2 else aa**2
     assert adaptive.rays["primary"] == 33 * 21 + refined.sum() * further
     one = mrt.render(1, **{**options, "aa": 1}, aamode="none").image
-    np.testing.assert_array_equal(adaptive.image[~refined], one[~refined])
+    assert_array_equal(adaptive.image[~refined], one[~refined])
     # the same up to 64 values summed in another order
-    np.testing.assert_allclose(adaptive.image[refined], full.image[refined], atol=1e-5)
+    assert_allclose(adaptive.image[refined], full.image[refined], atol=1e-5)
 
 
 @pytest.mark.parametrize("dof", ["report", "corrected"])
@@ -64,7 +69,7 @@ def test_any_focus_is_the_filter_over_the_sharp_picture(dof, distance, reach):
     )
     found = mrt.render(3, **options, focaldist=distance, focalrange=reach, dof=dof).image
     # with and without depth, two kernels: single roundings
-    np.testing.assert_allclose(found, expected, atol=2e-6)
+    assert_allclose(found, expected, atol=2e-6)
 
 
 class _Recorded(Progress):
@@ -98,3 +103,24 @@ def test_plan_says_that_one_random_ray_takes_noise_for_edges():
     for mode, integrator, spp in product(("sobel", "geometry"), ("path", None), (1, 2)):
         plan = str(mrt.render(scene, aa=2, aamode=mode, integrator=integrator, spp=spp).plan)
         assert ("noise will count as edges" in plan) == ((mode, integrator, spp) == ("sobel", "path", 1))
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian", "mitchell"])
+def test_the_noise_that_a_filter_averages_hides_fewer_edges(rfilter):
+    """A bright half behind a veil that stops every other ray; its edge is as strong as the pixels' own
+    variance lets it be, which other seeds show."""
+    black = {"type": "diffuse", "reflectance": 0.0}
+    veil = {"type": "mask", "opacity": 0.5, "nested": black}
+    nodes: dict[str, Any] = {"type": "scene", "integrator": {"type": "path"}}
+    nodes["sensor"] = sensor([0, 0, 0], [0, 0, -1], (48, 36), rfilter=rfilter)
+    nodes["veil"] = {"type": "sphere", "radius": 1, "bsdf": veil}
+    aside = mi.ScalarTransform4f().translate([10, 0, -9]).scale(10)
+    nodes["half"] = {"type": "rectangle", "to_world": aside, "emitter": {"type": "area", "radiance": 1.0}}
+    scene = mi.load_dict(nodes)
+    options = {"aa": 1, "aamode": "sobel", "spp": 64}
+    results = [mrt.render(scene, seed=seed, layers=["edges"], **options) for seed in range(24)]
+    variance = np.var([result.image for result in results], axis=0, ddof=1)
+    expected = [mrt.filters.sobel_edges(result.image, variance=variance).value for result in results]
+    found = [result.layers["edges.Y"] for result in results]
+    assert np.mean(expected) > 1
+    assert np.mean(found) == pytest.approx(np.mean(expected), rel=0.05)

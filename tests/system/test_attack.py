@@ -46,8 +46,9 @@ except mrt.SceneError as error:
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-def test_no_native_code_from_the_folders_of_process_and_scene(run_python, mrt_command, tmp_path) -> None:
-    trap, sign = tmp_path / "trap.so", tmp_path / "it ran"
+def test_no_native_code_from_the_folders_of_process_and_scene(run_python, mrt_command, tmp_path):
+    trap = tmp_path / "trap.so"
+    sign = tmp_path / "it ran"
     (tmp_path / "trap.c").write_text(TRAP)
     subprocess.run(["cc", "-shared", "-fPIC", "-o", trap, tmp_path / "trap.c"], check=True, timeout=60)
     for folder in (tmp_path, tmp_path / "scene", tmp_path / "more"):
@@ -74,10 +75,11 @@ def test_no_native_code_from_the_folders_of_process_and_scene(run_python, mrt_co
     plugins = tmp_path / "plugins"
     (plugins / "wicked.so").rename(plugins / "mrt_bsdf.so")  # looked for there first
     done = mrt_command(*words, MRT_TRAP=str(sign), code=1)
-    assert "native code that is not Mitsuba's" in done.stderr and not sign.exists()
+    assert "native code that is not Mitsuba's" in done.stderr
+    assert not sign.exists()
 
 
-def test_hundreds_of_python_shapes_load(variant: str, tmp_path: Path) -> None:
+def test_hundreds_of_python_shapes_load(variant, tmp_path):
     """Loaded in parallel, 300 of them overflowed the stack each time."""
     count = 400 if ROUNDS == 1 else 10_000
     cone = "<shape type='mrt_cone'><integer name='segments' value='3'/><point name='apex' value='{} 1 0'/>"
@@ -119,7 +121,7 @@ for text in (
 """
 
 
-def test_time_to_read_a_model_grows_with_its_size(run_python) -> None:
+def test_time_to_read_a_model_grows_with_its_size(run_python):
     """The first alone took half an hour; ``run_python`` waits two minutes."""
     lines = run_python(READ_MODELS).stdout.splitlines()
     assert [line.split()[0] for line in lines] == [*["SceneError"] * 3, "1", *["SceneError"] * 2, "1"], lines
@@ -129,7 +131,7 @@ def test_time_to_read_a_model_grows_with_its_size(run_python) -> None:
 
 
 @pytest.mark.parametrize("megabytes", [300] if ROUNDS == 1 else range(200, 1000, 50))
-def test_limited_addresses_end_in_a_message(run_command, megabytes: int) -> None:
+def test_limited_addresses_end_in_a_message(run_command, megabytes):
     command = f"{MRT} out 3 width=1500 height=1500 aa=1 quiet=1"
     done = run_command("sh", "-c", f"ulimit -v {megabytes * 1000} && exec {command}", code=None)
     if done.returncode != 0:
@@ -137,7 +139,7 @@ def test_limited_addresses_end_in_a_message(run_command, megabytes: int) -> None
 
 
 @pytest.mark.parametrize("depth", [1000, 100_000])
-def test_deep_nesting_is_refused(variant: str, tmp_path: Path, depth: int) -> None:
+def test_deep_nesting_is_refused(variant, tmp_path, depth):
     nested = "<shape type='instance'>" * depth + "</shape>" * depth
     (tmp_path / "deep.xml").write_text(scene_xml(nested))
     (tmp_path / "outer.xml").write_text(scene_xml("<include filename='deep.xml'/>"))
@@ -185,7 +187,7 @@ random.Random(1).shuffle(ODD)
 
 
 @pytest.mark.parametrize("place", range(min(8 * ROUNDS, len(ODD))))
-def test_every_plugin_in_every_place(mrt_command, tmp_path: Path, place: int) -> None:
+def test_every_plugin_in_every_place(mrt_command, tmp_path, place):
     """A picture, or one line that says why not; no crash, and no hang."""
     inside, words, variant = ODD[place]
     ball = "<shape type='sphere'/><emitter type='constant'/>"
@@ -200,7 +202,7 @@ def test_every_plugin_in_every_place(mrt_command, tmp_path: Path, place: int) ->
 
 
 @pytest.mark.parametrize("name", ["n" * 300, "closed/m", "pipe", "folder"])
-def test_unreadable_library_and_texture_are_warnings(variant: str, tmp_path: Path, name: str) -> None:
+def test_unreadable_library_and_texture_are_warnings(variant, tmp_path, name):
     """A mode of 0 does not keep the superuser out; a folder of that name stands for it."""
     (tmp_path / "closed").mkdir(mode=0o000)
     (tmp_path / "folder").mkdir()
@@ -213,19 +215,21 @@ def test_unreadable_library_and_texture_are_warnings(variant: str, tmp_path: Pat
     assert [" is missing or may not be read" in str(w.message) for w in caught] == [True, True]
 
 
-def test_messages_are_printable_short_and_few(variant: str, tmp_path: Path) -> None:
+def test_messages_are_printable_short_and_few(variant, tmp_path):
     model = tmp_path / "m.obj"
     for text in (f"v 0 0 {'z' * 200_000}", "\x1b]0;owned\x07 1", "f 1 2 \u202e3", "usemtl \x9b31m\nx"):
         model.write_text(text + "\n")
         with pytest.raises(SceneError) as caught, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             mrt.render(str(model), aa=1)
-        assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
+        assert str(caught.value).isprintable()
+        assert len(str(caught.value)) < 1000
     faces = "".join(f"usemtl m\x1b{i}\nf 1 2 3\n" for i in range(20_000))
     model.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + faces)
     with pytest.warns(mrt.MrtWarning) as warned:
         mrt.render(str(model), width=4, height=3, aa=1)
-    assert len(warned) == 1 and "and so do 19999 more materials" in str(warned[0].message)
+    assert len(warned) == 1
+    assert "and so do 19999 more materials" in str(warned[0].message)
     assert str(warned[0].message).isprintable()
 
 
@@ -244,7 +248,7 @@ print(found[:4] == found[4:], len(set(found)))
 
 
 @pytest.mark.parametrize("attempt", range(ROUNDS))
-def test_log_of_every_kernel_does_not_stop_the_command(start, tmp_path: Path, attempt: int) -> None:
+def test_log_of_every_kernel_does_not_stop_the_command(start, tmp_path, attempt):
     """Side by side, without a cache of kernels: one in thirty waited for itself for ever."""
     command = [MRT, "out", "3", "width=32", "height=24", "aa=2", "log=debug", "format=png"]
     nowhere = {name: subprocess.DEVNULL for name in ("stdout", "stderr")}
@@ -264,7 +268,7 @@ sys.exit(start())
 
 
 @pytest.mark.parametrize("attempt", range(3 * ROUNDS))
-def test_a_signal_leaves_both_pictures_old_or_new(start, tmp_path: Path, attempt: int) -> None:
+def test_a_signal_leaves_both_pictures_old_or_new(start, tmp_path, attempt):
     old = [tmp_path / "out.png", tmp_path / "out.exr"]
     for path in old:
         path.write_bytes(b"old")
@@ -275,7 +279,8 @@ def test_a_signal_leaves_both_pictures_old_or_new(start, tmp_path: Path, attempt
         process.stdout.readline()
         time.sleep(rng.uniform(0, 1.1))
         process.send_signal(number)
-        code, errors = process.wait(timeout=120), process.stderr.read()
+        code = process.wait(timeout=120)
+        errors = process.stderr.read()
     # outside of its work, at the very start or end, the command dies as any program
     assert code in (0, 130, 143, -number) and "Traceback" not in errors, errors
     assert len({path.read_bytes() == b"old" for path in old}) == 1
@@ -369,6 +374,6 @@ PROGRAMS = {
 
 @pytest.mark.parametrize("name", PROGRAMS)
 @pytest.mark.parametrize("attempt", range(ROUNDS))
-def test_threads_and_interrupts(run_python, name: str, attempt: int) -> None:
+def test_threads_and_interrupts(run_python, name, attempt):
     code, door, said = PROGRAMS[name]
     assert run_python(code, door).stdout == said

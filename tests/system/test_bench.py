@@ -26,17 +26,20 @@ def found(tmp_path_factory):
 
 def test_file_has_a_row_for_each_figure(found):
     run = json.loads(found.read_text())
-    assert {"mitsuba", "llvm", "python", "cores"} <= run["machine"].keys() and run["options"]["turns"] == 1
+    assert {"mitsuba", "llvm", "python", "cores"} <= run["machine"].keys()
+    assert run["options"]["turns"] == 1
     assert len(run["rows"]) == 2 + 3
     start, *_ = run["rows"].values()
-    assert start["goal"] == bench.START_GOAL and start["low"] <= start["ratio"] <= start["high"]
+    assert start["goal"] == bench.START_GOAL
+    assert start["low"] <= start["ratio"] <= start["high"]
 
 
 @pytest.mark.parametrize("name", ["200 lights", "aamode=noise", "small, with an update"])
 def test_renders_are_those_of_their_names(name, monkeypatch, variant):
     count, make = renders.CASES[name]
     monkeypatch.setitem(renders.CASES, name, (1, make))
-    assert renders.seconds(name) > 0 and count >= 1
+    assert renders.seconds(name) > 0
+    assert count >= 1
 
 
 def test_both_sides_take_turns(monkeypatch, tmp_path):
@@ -49,7 +52,8 @@ def test_both_sides_take_turns(monkeypatch, tmp_path):
     monkeypatch.setattr(bench, "start", lambda turns: {"seconds": float(turns)})
     assert bench.main(arguments) == 0
     rows = json.loads((tmp_path / "b.json").read_text())["rows"]
-    assert rows["small"]["ratio"] == 1 and rows["small"]["other_seconds"] == rows["small"]["seconds"] > 0
+    assert rows["small"]["ratio"] == 1
+    assert rows["small"]["other_seconds"] == rows["small"]["seconds"] > 0
 
 
 def test_comparison_prints_ratios(found, tmp_path, monkeypatch, capsys):
@@ -61,7 +65,9 @@ def test_comparison_prints_ratios(found, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench, "rows", lambda given: iter([*twice, ("new", {"seconds": 1.0})]))
     assert bench.main(["--compare", str(found), "--out", str(tmp_path / "b.json")]) == 0
     *_, columns, start, _, _, _, _, new = capsys.readouterr().out.splitlines()
-    assert columns.endswith("to then") and start.split()[-2:] == ["1.7", "2"] and new.endswith(" 1")
+    assert columns.endswith("to then")
+    assert start.split()[-2:] == ["1.7", "2"]
+    assert new.endswith(" 1")
     assert bench.read(tmp_path / "b.json")["small, loaded"] == {"seconds": 1.0, "to then": 2.0}
 
 
@@ -70,7 +76,8 @@ def test_a_file_of_another_kind_is_refused(text, tmp_path, capsys):
     (tmp_path / "other.json").write_text(text)
     with pytest.raises(SystemExit):
         bench.main(["--compare", str(tmp_path / "other.json"), "--out", str(tmp_path / "b.json")])
-    assert "cannot compare" in capsys.readouterr().err and not (tmp_path / "b.json").exists()
+    assert "cannot compare" in capsys.readouterr().err
+    assert not (tmp_path / "b.json").exists()
 
 
 def test_a_place_that_cannot_be_written_is_found_before_measuring(tmp_path, capsys):
@@ -79,7 +86,9 @@ def test_a_place_that_cannot_be_written_is_found_before_measuring(tmp_path, caps
     for out, reason in (("file/b.json", "cannot make the folder"), ("folder.json", "it is a folder")):
         assert bench.main(["--out", str(tmp_path / out)]) == 1
         text, errors = capsys.readouterr()
-        assert text == "" and errors.startswith("make bench: ") and reason in errors
+        assert text == ""
+        assert errors.startswith("make bench: ")
+        assert reason in errors
 
 
 def test_renders_know_public_names_only():

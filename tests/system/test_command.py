@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from mrt_mitsuba.output.files import read_exr
@@ -17,10 +18,11 @@ MRT = Path(sys.executable).with_name("mrt")
 TINY = ("width=16", "height=12", "quiet=1", "format=exr")
 
 
-def test_picture_and_its_two_files_of_the_same_bytes_each_time(mrt_command, tmp_path: Path) -> None:
+def test_picture_and_its_two_files_of_the_same_bytes_each_time(mrt_command, tmp_path):
     for name in "ab":
         done = mrt_command(name, "1", "width=64", "height=48", "aa=2", "layers=depth,normal")
-        assert not done.stderr and done.stdout.splitlines()[-1].startswith("Render time: ")
+        assert not done.stderr
+        assert done.stdout.splitlines()[-1].startswith("Render time: ")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.exr", "a.png", "b.exr", "b.png"]
     for ending in ("png", "exr"):
         assert (tmp_path / f"a.{ending}").read_bytes() == (tmp_path / f"b.{ending}").read_bytes()
@@ -34,7 +36,7 @@ def test_picture_and_its_two_files_of_the_same_bytes_each_time(mrt_command, tmp_
     known = "mrt:mitsuba mrt:drjit mrt:llvm software mrt:worldToCamera mrt:worldToNDC"
     assert set(known.split()) <= exr.header.keys()
     with Image.open(tmp_path / "a.png") as png:
-        np.testing.assert_array_equal(np.asarray(png), np.clip(np.trunc(exr.image * 255), 0, 255))
+        assert_array_equal(np.asarray(png), np.clip(np.trunc(exr.image * 255), 0, 255))
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
@@ -48,15 +50,16 @@ def test_picture_and_its_two_files_of_the_same_bytes_each_time(mrt_command, tmp_
         ("out 0 width=8 height=6 aa=1 format=exr >&- 2>&-", 0, "", ["out.exr"]),
     ],
 )
-def test_output_that_cannot_be_printed(run_command, tmp_path: Path, words, code, errors, left) -> None:
+def test_output_that_cannot_be_printed(run_command, tmp_path, words, code, errors, left):
     done = run_command("sh", "-c", f"{MRT} {words}", code=code)
-    assert done.stderr.startswith(errors) and done.stderr.count("\n") == bool(errors)
+    assert done.stderr.startswith(errors)
+    assert done.stderr.count("\n") == bool(errors)
     assert [path.name for path in tmp_path.iterdir()] == left
     if left:
         assert read_exr(tmp_path / "out.exr").image.shape == (6, 8, 3)
 
 
-def test_kernels_that_cannot_be_read_back_or_kept_are_made_anew(mrt_command, tmp_path: Path) -> None:
+def test_kernels_that_cannot_be_read_back_or_kept_are_made_anew(mrt_command, tmp_path):
     """Where there is no place for them, Dr.Jit says so in one line."""
     home = tmp_path / "home"
     home.mkdir()
@@ -64,31 +67,35 @@ def test_kernels_that_cannot_be_read_back_or_kept_are_made_anew(mrt_command, tmp
     kernels = sorted((home / ".drjit").iterdir())
     for k, kernel in enumerate(kernels):
         kernel.write_bytes(b"rubbish" * 999 if k % 2 else kernel.read_bytes()[:10])
-    assert kernels and not mrt_command("after", "0", *TINY, HOME=str(home)).stderr
+    assert kernels
+    assert not mrt_command("after", "0", *TINY, HOME=str(home)).stderr
     (tmp_path / "file").write_text("")
     assert mrt_command("without", "0", *TINY, HOME=str(tmp_path / "file")).stderr.count("\n") <= 1
     good, *others = (read_exr(tmp_path / f"{name}.exr").image for name in ("good", "after", "without"))
-    np.testing.assert_array_equal(others, [good, good])
+    assert_array_equal(others, [good, good])
 
 
-def test_exported_scene_renders(mrt_command, tmp_path: Path) -> None:
+def test_exported_scene_renders(mrt_command, tmp_path):
     done = mrt_command("export", "0", "--xml", "zero.xml", "--stock", "width=20", "height=10")
     assert (done.stdout, done.stderr) == ("Wrote zero.xml\n", "")
     text = (tmp_path / "zero.xml").read_text()
-    assert "roughplastic" in text and "mrt_" not in text
+    assert "roughplastic" in text
+    assert "mrt_" not in text
     mrt_command("out", "scene=zero.xml", "aa=1", "aamode=none", "format=exr")
     image = read_exr(tmp_path / "out.exr").image
     assert image.shape == (10, 20, 3)
-    np.testing.assert_allclose(image[0, 0], (0.1, 0.3, 0.5), atol=1e-6)  # the sky of scene 0, in float32
+    assert_allclose(image[0, 0], (0.1, 0.3, 0.5), atol=1e-6)  # the sky of scene 0, in float32
 
 
-def test_doctor(mrt_command) -> None:
+def test_doctor(mrt_command):
     said = mrt_command("doctor").stdout
     assert "self-test: scene 0 at 16x12 in llvm_ad_rgb: passed" in said
-    assert "LLVM" in said and "variants: scalar_rgb" in said and "not installed" not in said
+    assert "LLVM" in said
+    assert "variants: scalar_rgb" in said
+    assert "not installed" not in said
 
 
-def test_levels_log_more_and_more(mrt_command) -> None:
+def test_levels_log_more_and_more(mrt_command):
     silent, info, debug = (
         mrt_command("a", "0", "width=16", "height=12", "quiet=1", f"log={level}").stderr.splitlines()
         for level in ("warn", "info", "debug")

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
+from cases import Cases
+from numpy.testing import assert_array_equal
 from PIL import Image
 from scipy import ndimage, stats
 
@@ -28,7 +30,7 @@ def spotted(by: float = 0.1) -> np.ndarray:
     return image
 
 
-def test_measures_are_those_of_a_known_difference() -> None:
+def test_measures_are_those_of_a_known_difference():
     found = mrt.compare(spotted(), GREY)
     n = GREY.size
     assert found.mae == pytest.approx(0.1 / n, rel=1e-6)
@@ -36,15 +38,17 @@ def test_measures_are_those_of_a_known_difference() -> None:
     assert found.rel_mse == pytest.approx(0.01 / n / 0.26, rel=1e-6)
     assert found.psnr == pytest.approx(10 * np.log10(n / 0.01), rel=1e-6)
     assert mrt.compare(spotted(), GREY, peak=2).psnr == pytest.approx(10 * np.log10(4 * n / 0.01), rel=1e-6)
-    assert found.largest == pytest.approx(0.1, rel=1e-6) and found.place == (3, 5)
-    assert found.flip > 0 and found.p_value is None
-    np.testing.assert_array_equal(found.difference, spotted() - GREY)
+    assert found.largest == pytest.approx(0.1, rel=1e-6)
+    assert found.place == (3, 5)
+    assert found.flip > 0
+    assert found.p_value is None
+    assert_array_equal(found.difference, spotted() - GREY)
     assert "rmse" in found._repr_html_()
     same = mrt.compare(GREY, GREY)
     assert (same.mae, same.rmse, same.psnr, same.largest, same.flip) == (0, 0, np.inf, 0, 0)
 
 
-def test_infinite_depths_are_equal_where_both_are() -> None:
+def test_infinite_depths_are_equal_where_both_are():
     depth = np.array([[1.0, np.inf], [2.0, np.inf]], np.float32)
     other = np.array([[1.5, np.inf], [2.0, 3.0]], np.float32)
     assert mrt.compare(depth, depth).largest == 0
@@ -59,7 +63,7 @@ def mean_of(rays: np.ndarray, path: Path) -> Path:
     return path
 
 
-def test_more_than_noise(tmp_path: Path) -> None:
+def test_more_than_noise(tmp_path):
     """The mean of 16 rays: p is small for one picture 2 % brighter, or one pixel off by 14 deviations."""
     rng = np.random.default_rng(1)
 
@@ -74,10 +78,11 @@ def test_more_than_noise(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("share", "deviation"), [(0, 0), (0.01, 0), (0, 0.6), (0.0001, 0.6)])
-def test_p_value_is_uniform_for_equal_pictures(share: float, deviation: float, tmp_path: Path) -> None:
+def test_p_value_is_uniform_for_equal_pictures(share, deviation, tmp_path):
     """Also where a few rays are bright, and most pixels state far too small an error, and under filters
     of a Gaussian of some pixels."""
-    rng, size = np.random.default_rng(2), (16, 24, 32, 1)
+    rng = np.random.default_rng(2)
+    size = (16, 24, 32, 1)
 
     def noisy(name: str) -> Path:
         rays = 0.5 + 0.05 * rng.normal(size=size) + 50 * (rng.random(size) < share)
@@ -87,7 +92,7 @@ def test_p_value_is_uniform_for_equal_pictures(share: float, deviation: float, t
     assert stats.kstest(p, "uniform").pvalue > 0.01
 
 
-def test_results_have_layers(variant) -> None:
+def test_results_have_layers(variant):
     result = mrt.render(0, width=24, height=18, aa=1, layers=["depth", "normal"])
     assert mrt.compare(result, result.image).largest == 0
     assert mrt.compare(result, result, layer="normal").difference.shape == (18, 24, 3)
@@ -118,54 +123,55 @@ def files(tmp_path: Path) -> dict[str, str]:
     return {path.stem: str(path) for path in tmp_path.iterdir()} | {"none": str(tmp_path / "none.exr")}
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        (("a", "b"), 0, "rmse     0.004167"),
-        (("a", "b", "rmse=0.005", "largest=0.2", "psnr=40", "flip=0.5"), 0, "ok     psnr: 47.6 >= 40"),
-        (("a", "b", "rmse=0.004", "largest=0.2"), 1, "MISSED rmse: 0.004167 <= 0.004"),
-        (("a", "b", "psnr=50"), 1, "MISSED psnr"),
-        (("a", "b", "layer=depth", "mae=0.5"), 1, "MISSED mae: 1 <= 0.5"),
-        (("a", "b", "layer=depth.Z"), 0, "largest  1\n"),
-        (("a", "b", "layer=depth", "flip=0.1"), 2, "FLIP needs three channels"),
-        (("a", "b", "p_value=0.1"), 2, 'layer "error"'),
-        (("a", "b", "layer=normal"), 2, "has no layer 'normal'; it has B, G, R, depth"),
-        (("a", "small"), 2, "16x12 with 3 channels and 16x5 with 3 channels"),
-        (("nan", "b"), 2, "is NaN in 1 pixels, the first at row 3, column 5"),
-        (("a", "cut"), 2, "not a whole EXR"),
-        (("a", "none"), 2, "No such file"),
-        (("a", "pipe"), 2, "pipe.exr: it is not a regular file"),
-        (("a", "shifted"), 2, "the data windows (0, 0, 15, 11) and (100, 200, 115, 211)"),
-        (("tiled", "b", "largest=0"), 0, "ok     largest"),
-        (("parts", "parts", "layer=right", "largest=0"), 0, "ok     largest"),
-        (("a", "parts"), 2, "has no layer 'R, G, B'; it has left, right"),
-        (("a", "deep"), 2, "many values in a pixel; flatten it first"),
-        (("a",), 2, "B.exr is missing. Usage: mrt diff A.exr B.exr"),
-        (("a", "b", "rsme=1"), 2, "unknown option 'rsme', meant rmse?"),
-        (("a", "b", "rmse=much"), 2, "must be a number"),
-        (("a", "b", "rmse=1", "rmse=2"), 2, "given twice"),
-    ],
-)
-def test_command(words, code: int, said: str, files, capfd) -> None:
+commands = Cases()
+commands(("a", "b"), 0, "rmse     0.004167")
+commands(("a", "b", "rmse=0.005", "largest=0.2", "psnr=40", "flip=0.5"), 0, "ok     psnr: 47.6 >= 40")
+commands(("a", "b", "rmse=0.004", "largest=0.2"), 1, "MISSED rmse: 0.004167 <= 0.004")
+commands(("a", "b", "psnr=50"), 1, "MISSED psnr")
+commands(("a", "b", "layer=depth", "mae=0.5"), 1, "MISSED mae: 1 <= 0.5")
+commands(("a", "b", "layer=depth.Z"), 0, "largest  1\n")
+commands(("a", "b", "layer=depth", "flip=0.1"), 2, "FLIP needs three channels")
+commands(("a", "b", "p_value=0.1"), 2, 'layer "error"')
+commands(("a", "b", "layer=normal"), 2, "has no layer 'normal'; it has B, G, R, depth")
+commands(("a", "small"), 2, "16x12 with 3 channels and 16x5 with 3 channels")
+commands(("nan", "b"), 2, "is NaN in 1 pixels, the first at row 3, column 5")
+commands(("a", "cut"), 2, "not a whole EXR")
+commands(("a", "none"), 2, "No such file")
+commands(("a", "pipe"), 2, "pipe.exr: it is not a regular file")
+commands(("a", "shifted"), 2, "the data windows (0, 0, 15, 11) and (100, 200, 115, 211)")
+commands(("tiled", "b", "largest=0"), 0, "ok     largest")
+commands(("parts", "parts", "layer=right", "largest=0"), 0, "ok     largest")
+commands(("a", "parts"), 2, "has no layer 'R, G, B'; it has left, right")
+commands(("a", "deep"), 2, "many values in a pixel; flatten it first")
+commands(("a",), 2, "B.exr is missing. Usage: mrt diff A.exr B.exr")
+commands(("a", "b", "rsme=1"), 2, "unknown option 'rsme', meant rmse?")
+commands(("a", "b", "rmse=much"), 2, "must be a number")
+commands(("a", "b", "rmse=1", "rmse=2"), 2, "given twice")
+
+
+@pytest.mark.parametrize(("words", "code", "said"), commands)
+def test_command(words, code, said, files, capfd):
     assert main(["diff", *(files.get(word, word) for word in words)]) == code
     out, err = capfd.readouterr()
     assert said in (err if code == 2 else out)
     assert err.count("\n") == (code == 2)
 
 
-def test_difference_is_written(files, tmp_path: Path, capsys) -> None:
+def test_difference_is_written(files, tmp_path, capsys):
     assert main(["diff", files["a"], files["b"], f"out={tmp_path / 'd.png'}"]) == 0
     written = read_exr(tmp_path / "d.exr")
-    np.testing.assert_array_equal(written.image, spotted() - GREY)
+    assert_array_equal(written.image, spotted() - GREY)
     assert float(written.header["rmse"]) == pytest.approx(0.1 / GREY.size**0.5, rel=1e-6)
     shown = np.asarray(Image.open(tmp_path / "d.png")).astype(int).sum(axis=-1)
-    assert np.unravel_index(shown.argmax(), shown.shape) == (3, 5) and (shown < 20).sum() == shown.size - 1
+    assert np.unravel_index(shown.argmax(), shown.shape) == (3, 5)
+    assert (shown < 20).sum() == shown.size - 1
     assert main(["diff", files["a"], files["b"], f"out={tmp_path}/no/such/place"]) == 2
     before = (tmp_path / "a.exr").read_bytes()
     (tmp_path / "link.png").symlink_to("a.exr")
     for out in ("a", "a.exr", "a.png", "b", "../" + tmp_path.name + "/a", "link"):
         assert main(["diff", files["a"], files["b"], f"out={tmp_path}/{out}"]) == 2
-    assert (tmp_path / "a.exr").read_bytes() == before and not (tmp_path / "a.png").exists()
+    assert (tmp_path / "a.exr").read_bytes() == before
+    assert not (tmp_path / "a.png").exists()
 
 
 # ------------------------------------------ Sets of renders ------------------------------------------
@@ -177,7 +183,8 @@ TRUTH = np.stack([0.2 + X, 0.5 * Y, np.maximum(X - 0.5, 0)], axis=-1)  # bright,
 
 def renders(picture: np.ndarray, seed: int, draw: str = "normal") -> np.ndarray:
     """Eight renders with noise of mean 0 and a tenth of the picture as standard deviation."""
-    random, size = np.random.default_rng(seed), (8, *picture.shape)
+    random = np.random.default_rng(seed)
+    size = (8, *picture.shape)
     noise = random.normal(size=size) if draw == "normal" else random.gamma(16, size=size) / 4 - 4
     return picture * (1 + 0.1 * noise)
 
@@ -191,9 +198,10 @@ def pair(changed: np.ndarray, seed: int = 0, draw: str = "normal") -> dict[str, 
 
 
 @pytest.mark.parametrize("draw", ["normal", "gamma"])
-def test_equal_pictures_are_rejected_as_often_as_the_level_says(draw: str) -> None:
+def test_equal_pictures_are_rejected_as_often_as_the_level_says(draw):
     """gamma: noise as skewed as a mean of 16 exponential samples, which a picture's noise resembles."""
-    level, trials = 0.1, 300
+    level = 0.1
+    trials = 300
     found = np.array([list(pair(TRUTH, i, draw).values()) for i in range(trials)])
     # bounds fail a right test once in ten thousand times; the seeds are fixed
     one = 1 - (1 - level) ** (1 / 3)
@@ -213,13 +221,13 @@ EDGE[16:, 16:] = 1.09  # the last tile, which is half as high
     [(1.02, "image", "pixel"), (SPOT, "pixel", "image"), (SPOT, "pixel", "tile"), (PATCH, "tile", "pixel"),
      (EDGE, "tile", "pixel")],
 )  # fmt: skip
-def test_each_question_sees_what_the_others_do_not(factor, seen: str, unseen: str) -> None:
+def test_each_question_sees_what_the_others_do_not(factor, seen, unseen):
     """A scale by the mean, a pixel by itself, a patch by its tile."""
     found = pair(factor * TRUTH)
     assert found[seen] < 1e-3 < found[unseen]
 
 
-def test_a_picture_without_noise_is_compared_too() -> None:
+def test_a_picture_without_noise_is_compared_too():
     """The sky has no noise at all: there any difference counts, but that of rounding does not."""
     flat = np.full((8, *SHAPE), 0.3)
     assert least(flat.astype(np.float32), flat) > 0.1
@@ -230,7 +238,7 @@ def test_a_picture_without_noise_is_compared_too() -> None:
     assert least(renders(1.05 * TRUTH, 1), [TRUTH, TRUTH]) < 1e-3 < least(renders(TRUTH, 1), [TRUTH, TRUTH])
 
 
-def test_p_values_are_welchs_of_sums_of_cells() -> None:
+def test_p_values_are_welchs_of_sums_of_cells():
     a, b = np.random.default_rng(0).normal(0.5, 0.02, (2, 6, 17, 33, 1))
     p = stats.ttest_ind(a.sum(axis=(1, 2, 3)), b.sum(axis=(1, 2, 3)), equal_var=False).pvalue
     assert p_values(a, b, tile=16)["image"] == pytest.approx(1 - (1 - p) ** 3, rel=1e-2)
@@ -241,6 +249,6 @@ def test_p_values_are_welchs_of_sums_of_cells() -> None:
     [(TRUTH[None], "two or more"), (TRUTH, "two or more"), (np.ones((2, 3, 3, 3)), "of one size"),
      (np.full((2, *SHAPE), np.inf), "infinite")],
 )  # fmt: skip
-def test_wrong_renders_are_named(wrong, message: str) -> None:
+def test_wrong_renders_are_named(wrong, message):
     with pytest.raises(mrt.UsageError, match=message):
         p_values(wrong, np.ones((2, *SHAPE)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from argparse import Namespace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -17,7 +16,8 @@ from mrt_mitsuba.validation import bench
 
 SIZE = {"width": 16, "height": 12}
 # Float32 in another order of operations; at edges and in narrow highlights a rounding can turn a pixel
-NOISE, TURNED = 2e-4, 0.02
+NOISE = 2e-4
+TURNED = 0.02
 
 
 def different(a: np.ndarray, b: np.ndarray) -> float:
@@ -44,7 +44,7 @@ MOVING = {"motion": (0.3, 0.1, 0.4), "motionsamples": 4, "motionmode": "stratifi
     indirect=["variant"],
 )
 @pytest.mark.filterwarnings("ignore:scalar_:mrt_mitsuba.MrtWarning")
-def test_pictures_are_those_of_the_scalar_variant(number: int, variant: str, more: dict[str, Any]) -> None:
+def test_pictures_are_those_of_the_scalar_variant(number, variant, more):
     options = {"aa": 1, "aamode": "none", "focaldist": 0, **SIZE, **more}
     result = mrt.render(number, variant=variant, **options)
     truth = mrt.render(number, variant="scalar_" + variant.split("_")[-1], **options)
@@ -55,20 +55,22 @@ def test_pictures_are_those_of_the_scalar_variant(number: int, variant: str, mor
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb"], indirect=True)
-def test_filters_and_updates_on_a_device(variant: str) -> None:
+def test_filters_and_updates_on_a_device(variant):
     """Tables made of NumPy's arrays, ids of shapes and sizes that the host reads are what could go wrong."""
     scene = mi.load_dict(mrt.scene_dict(3, **SIZE))
     before = [mrt.render(scene, aa=2, lattice="report", focaldist=2.0).image for _ in range(3)]
-    assert np.array_equal(before[0], before[1]) and np.array_equal(before[1], before[2])
+    assert np.array_equal(before[0], before[1])
+    assert np.array_equal(before[1], before[2])
     parameters = mi.traverse(scene)
     key = next(k for k in list(parameters.keys()) if k.endswith("alpha"))
     parameters[key] = mi.Float(0.4)
     parameters.update()
     after = mrt.render(scene, aa=2, lattice="report", focaldist=2.0).image
-    assert np.isfinite(after).all() and not np.array_equal(after, before[0])
+    assert np.isfinite(after).all()
+    assert not np.array_equal(after, before[0])
 
 
-def test_make_test_gpu_runs_its_selection_where_it_is_told_to(run_command) -> None:
+def test_make_test_gpu_runs_its_selection_where_it_is_told_to(run_command):
     """And ends with an error where the device is not there."""
     tests = (Path(__file__), Path(__file__).parents[1] / "unit" / "test_parameters.py")
     words = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "device", "--co", *tests)
@@ -80,9 +82,11 @@ def test_make_test_gpu_runs_its_selection_where_it_is_told_to(run_command) -> No
         assert "needs an NVIDIA GPU" in missing.stdout + missing.stderr
 
 
-def test_bench_of_a_device_measures_pairs_in_its_variant(monkeypatch) -> None:
+def test_bench_of_a_device_measures_pairs_in_its_variant(monkeypatch):
     monkeypatch.setattr(bench, "DEVICE_SIZES", [(80, 60)])
     rows = bench.rows(Namespace(device="llvm_ad_spectral", turns=1))
     name, row = next(rows)
-    assert mi.variant() == "llvm_ad_spectral" and name.endswith("materials, 80x60")
-    assert row["seconds"] > 0 and row["other_seconds"] > 0
+    assert mi.variant() == "llvm_ad_spectral"
+    assert name.endswith("materials, 80x60")
+    assert row["seconds"] > 0
+    assert row["other_seconds"] > 0

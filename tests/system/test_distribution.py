@@ -59,7 +59,7 @@ def content(folder: Path) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def test_wheel_holds_every_file_of_the_packages(dist: Path, source: Path) -> None:
+def test_wheel_holds_every_file_of_the_packages(dist, source):
     names = set(content(dist))
     wanted = set()
     for folder, place in FOLDERS.items():
@@ -71,12 +71,12 @@ def test_wheel_holds_every_file_of_the_packages(dist: Path, source: Path) -> Non
     assert all(name in wanted or ".dist-info/" in name for name in names), "nothing else"
 
 
-def test_wheel_built_without_the_sdist_is_the_same(dist: Path, source: Path, tmp_path: Path) -> None:
+def test_wheel_built_without_the_sdist_is_the_same(dist, source, tmp_path):
     run(sys.executable, "-m", "build", "--wheel", "--outdir", tmp_path, source, cwd=tmp_path)
     assert content(tmp_path) == content(dist)
 
 
-def test_sdist_brings_what_the_tests_need(dist: Path) -> None:
+def test_sdist_brings_what_the_tests_need(dist):
     (path,) = dist.glob("*.tar.gz")
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
@@ -84,7 +84,8 @@ def test_sdist_brings_what_the_tests_need(dist: Path) -> None:
     assert wanted <= names
     tests = {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("*.py")}
     assert tests <= names
-    assert "docs/index.md" in names and not any(name.startswith("docs/_build") for name in names)
+    assert "docs/index.md" in names
+    assert not any(name.startswith("docs/_build") for name in names)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +98,7 @@ def installed(dist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return programs
 
 
-def test_installed_command_renders(installed: Path, tmp_path: Path) -> None:
+def test_installed_command_renders(installed, tmp_path):
     run(installed / "mrt", "out", "3", "width=64", "height=48", cwd=tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"out.png", "out.exr"}
     assert "passed" in run(installed / "mrt", "doctor", cwd=tmp_path)

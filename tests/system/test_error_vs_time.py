@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from cases import Cases
 from nodes import rgb, sensor
 
 import mrt_mitsuba as mrt
@@ -23,13 +24,10 @@ ONE_RAY = {"aa": 1, "aamode": "none"}
 @pytest.fixture
 def scene(variant):
     """A diffuse ball under a bright sky: every path is one bounce, noise is tame, path is direct."""
-    return {
-        "type": "scene",
-        "sensor": sensor([0, 1, 3], [0, 0, 0], SIZE),
-        "sky": {"type": "constant"},
-        "ball": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "diffuse"}},
-        "light": {"type": "point", "position": [2, 2, 2], "intensity": rgb(9.0, 9.0, 9.0)},
-    }
+    nodes = {"type": "scene", "sensor": sensor([0, 1, 3], [0, 0, 0], SIZE), "sky": {"type": "constant"}}
+    nodes["ball"] = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "diffuse"}}
+    nodes["light"] = {"type": "point", "position": [2, 2, 2], "intensity": rgb(9.0, 9.0, 9.0)}
+    return nodes
 
 
 def path(spp: int, **more: object) -> dict[str, object]:
@@ -40,21 +38,26 @@ def test_errors_fall_as_theory_says_and_a_bias_is_found(scene):
     cases = {f"path {n}": path(n) for n in (4, 16, 64)}
     cases |= {f"blind {n}": path(n, integrator={"type": "path", "max_depth": 1}) for n in (1, 16)}
     found = mrt.error_vs_time(scene, cases, reference=path(2048), repeats=6, shared=ONE_RAY)
-    assert not found.failed and list(found.families) == ["path", "blind"]
+    assert not found.failed
+    assert list(found.families) == ["path", "blind"]
     points = found.points
-    few, many = points["path 4"], points["path 64"]
+    few = points["path 4"]
+    many = points["path 64"]
     # 768 pixels of 6 repeats: their mean square is known to some 5 %
     assert few.rmse / many.rmse == pytest.approx(4, rel=0.15)
     assert few.rmse**2 == pytest.approx(few.variance, rel=0.1)
-    assert few.bias_interval[0] == 0 and few.bias_interval[1] < 0.5 * few.rmse  # a quarter of the MSE at most
+    assert few.bias_interval[0] == 0
+    assert few.bias_interval[1] < 0.5 * few.rmse  # a quarter of the MSE at most
     blind = points["blind 16"]
-    assert blind.bias == pytest.approx(blind.rmse, rel=0.01) and blind.bias_interval[0] > 0.9 * blind.bias
+    assert blind.bias == pytest.approx(blind.rmse, rel=0.01)
+    assert blind.bias_interval[0] > 0.9 * blind.bias
     # the reference's error is that of 2048 rays
     assert found.reference_error == pytest.approx(many.rmse * (64 / 2048) ** 0.5, rel=0.15)
     assert few.seconds_interval[0] <= few.seconds <= few.seconds_interval[1]
     assert few.rmse_interval[0] < few.rmse < few.rmse_interval[1]
     assert few.efficiency == pytest.approx(1 / few.variance / few.seconds)
-    assert few.cold > 0 and few.rays["primary"] == 4 * SIZE[0] * SIZE[1]
+    assert few.cold > 0
+    assert few.rays["primary"] == 4 * SIZE[0] * SIZE[1]
     assert "<iframe" in found._repr_html_()
 
 
@@ -78,11 +81,13 @@ def test_failed_cases_are_kept_with_the_reason(scene, tmp_path):
     }
     cases = {"good": path(4), **bad}
     found = mrt.error_vs_time(scene, cases, reference=path(64), repeats=1, shared=ONE_RAY)
-    assert list(found.points) == ["good"] and list(found.failed) == list(bad)
+    assert list(found.points) == ["good"]
+    assert list(found.failed) == list(bad)
     assert all(word in why for word, why in found.failed.items()), found.failed
     found.save(tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())["studies"]["error-vs-time"]
-    assert summary["verdict"] == "missed" and len(summary["tables"]["failed"]["rows"]) == 4
+    assert summary["verdict"] == "missed"
+    assert len(summary["tables"]["failed"]["rows"]) == 4
     assert "one repeat" in (tmp_path / "index.html").read_text("utf-8")
 
 
@@ -105,15 +110,14 @@ def test_references_of_other_kinds(variant, tmp_path):
     assert found.reference_error == pytest.approx(0.01)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"cases": {}}, "at least one case"),
-        ({"repeats": 0}, "one repeat"),
-        ({"cases": {"a": {"seed": 3}}}, "a sets a seed"),
-        ({"reference": np.ones((3, 3, 4, 1))}, "has the shape"),
-    ],
-)
+wrong = Cases()
+wrong({"cases": {}}, "at least one case")
+wrong({"repeats": 0}, "one repeat")
+wrong({"cases": {"a": {"seed": 3}}}, "a sets a seed")
+wrong({"reference": np.ones((3, 3, 4, 1))}, "has the shape")
+
+
+@pytest.mark.parametrize(("arguments", "message"), wrong)
 def test_wrong_arguments(arguments, message, variant):
     with pytest.raises(mrt.UsageError, match=message):
         mrt.error_vs_time(0, **{"cases": {"a": {}}, "reference": {}, **arguments})
@@ -140,21 +144,23 @@ def test_time_to_an_error_is_read_off_the_curve():
     assert np.isnan([*once.time_to(0.1)["a"][1:], once.points["a"].rmse_interval[1]]).all()
 
 
-NAMED, LIKE, ONLY = "a is the fastest, 1", "no winner, for the intervals overlap: a, b", "only a comes so low"
+NAMED = "a is the fastest, 1"
+LIKE = "no winner, for the intervals overlap: a, b"
+ONLY = "only a comes so low"
 
 
-@pytest.mark.parametrize(
-    ("times", "rmse", "errors", "verdict"),
-    [
-        ([2.0, 2.1, 1.9, 2.05], 0.1, (0.1,), f"RMSE of 0.1: {NAMED}"),
-        ([0.9, 1.3, 0.8, 1.4], 0.1, (0.1,), LIKE),
-        ([1.0] * 4, 0.2, (0.1,), ONLY),
-        ([1.0] * 4, 0.2, (1e-3,), "no case comes so low"),
-    ],
-)
+races = Cases()
+races([2.0, 2.1, 1.9, 2.05], 0.1, (0.1,), f"RMSE of 0.1: {NAMED}")
+races([0.9, 1.3, 0.8, 1.4], 0.1, (0.1,), LIKE)
+races([1.0] * 4, 0.2, (0.1,), ONLY)
+races([1.0] * 4, 0.2, (1e-3,), "no case comes so low")
+
+
+@pytest.mark.parametrize(("times", "rmse", "errors", "verdict"), races)
 def test_a_winner_is_named_only_if_intervals_are_apart(times, rmse, errors, verdict):
     found = found_of(point("a", [1.0, 1.1, 0.9, 1.05]), point("b", times, rmse), errors=errors)
-    assert verdict in found.verdicts[0] and verdict in str(found)
+    assert verdict in found.verdicts[0]
+    assert verdict in str(found)
 
 
 @pytest.mark.parametrize("count", [3, 5, 10])
@@ -163,8 +169,12 @@ def test_intervals_cover_what_they_should_and_equal_cases_have_no_winner(count):
 
     200 trials leave ± 4.6 %. Intervals that overlap are a test far stricter than one of 5 %.
     """
-    rng, trials, pixels, bias = np.random.default_rng(count), 200, 64, 0.05
-    held, winners = np.zeros(3), 0
+    rng = np.random.default_rng(count)
+    trials = 200
+    pixels = 64
+    bias = 0.05
+    held = np.zeros(3)
+    winners = 0
     for _ in range(trials):
         times = np.exp(rng.normal(0, 0.3, (2, count)))
         pictures = bias + rng.normal(0, 0.3, (count, pixels))
@@ -188,11 +198,13 @@ reference = {aa = 4}
 
 
 def test_command_writes_a_page(tmp_path, capsys, variant):
-    out, cases = tmp_path / "report", tmp_path / "cases.toml"
+    out = tmp_path / "report"
+    cases = tmp_path / "cases.toml"
     cases.write_text(GOOD)
     assert main(["error-vs-time", "3", f"cases={cases}", f"out={out}"]) == 0
     shown = capsys.readouterr().out
-    assert "aa=2" in shown and "index.html" in shown
+    assert "aa=2" in shown
+    assert "index.html" in shown
     names = {path.name.removeprefix("error-vs-time-") for path in out.iterdir()}
     assert {"index.html", "summary.json", "diagram.png", "points.csv", "times.csv"} <= names
     cases.write_text(GOOD + '"bad" = {aa = 1, lattice = "none"}\n')

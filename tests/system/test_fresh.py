@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -15,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from nodes import group, rgb, sensor
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
 
@@ -27,21 +27,21 @@ RED, GREEN = ({"type": "mrt_bsdf", "diffuse_reflectance": color} for color in CO
 
 
 def content(fresnel: str) -> dict[str, Any]:
-    inside = {"type": "shapegroup", "box": {"type": "cube", "bsdf": {"type": "diffuse"}}}
+    nodes: dict[str, Any] = {"type": "scene", "sensor": sensor([0, 2, 7], [0, 0.5, 0], (12, 9))}
+    nodes["light"] = {"type": "mrt_light", "position": [3, 5, 4]}
+    nodes["sky"] = {"type": "constant", "radiance": 0.3}
+    for k in range(4):
+        paint = {**(GREEN if k % 2 else RED), "fresnel": fresnel}
+        nodes[f"s{k}"] = {"type": "sphere", "center": [1.2 * k - 2, 0.5, 0], "radius": 0.5, "bsdf": paint}
+    nodes["cone"] = {"type": "mrt_cone", "apex": [0, 2, -1], "base_center": [0, 0, -1], "bsdf": GREEN}
+    aside = mi.ScalarTransform4f().translate([-2, 2, -1]).scale(0.5)
+    nodes["mesh"] = {"type": "cube", "to_world": aside}
+    inside = {"type": "cube", "bsdf": {"type": "diffuse"}}
+    nodes["group"] = {"type": "shapegroup", "box": inside}
     place = mi.ScalarTransform4f().translate([2.5, 0.5, 0]).scale(0.4)
-    return {
-        "type": "scene",
-        "sensor": sensor([0, 2, 7], [0, 0.5, 0], (12, 9)),
-        "light": {"type": "mrt_light", "position": [3, 5, 4]},
-        "sky": {"type": "constant", "radiance": 0.3},
-        **{f"s{k}": {"type": "sphere", "center": [1.2 * k - 2, 0.5, 0], "radius": 0.5,
-                     "bsdf": {**(GREEN if k % 2 else RED), "fresnel": fresnel}} for k in range(4)},
-        "cone": {"type": "mrt_cone", "apex": [0, 2, -1], "base_center": [0, 0, -1], "bsdf": GREEN},
-        "mesh": {"type": "cube", "to_world": mi.ScalarTransform4f().translate([-2, 2, -1]).scale(0.5)},
-        "group": inside,
-        "instance": {"type": "instance", "to_world": place, "of": {"type": "ref", "id": "group"}},
-        "floor": {"type": "mrt_plane", "normal": [0, 1, 0], "bsdf": {**RED, "fresnel": fresnel}},
-    }  # fmt: skip
+    nodes["instance"] = {"type": "instance", "to_world": place, "of": {"type": "ref", "id": "group"}}
+    nodes["floor"] = {"type": "mrt_plane", "normal": [0, 1, 0], "bsdf": {**RED, "fresnel": fresnel}}
+    return nodes
 
 
 def picture(scene: mi.Scene, integrator: Any) -> np.ndarray:
@@ -49,10 +49,11 @@ def picture(scene: mi.Scene, integrator: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize("part", [0, 1, pytest.param(2, marks=pytest.mark.attack)])
-def test_edited_scenes_are_drawn_as_scenes_made_anew(part: int, variant: str, tmp_path: Path) -> None:
+def test_edited_scenes_are_drawn_as_scenes_made_anew(part, variant, tmp_path):
     """To the bit, and those made anew in another process."""
     mi.set_log_level(mi.LogLevel.Error)
-    first, count = 20 + 1000 * part, 20 if part < 2 else 72 * ROUNDS
+    first = 20 + 1000 * part
+    count = 20 if part < 2 else 72 * ROUNDS
     path = tmp_path / "anew.npz"
     words = [sys.executable, edits.__file__, str(first), str(count), str(path)]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as other:
@@ -65,10 +66,10 @@ def test_edited_scenes_are_drawn_as_scenes_made_anew(part: int, variant: str, tm
         for number, content, done in edits.stories(first, count):
             for step, (live, fresh) in enumerate(zip(pictures[number], anew[str(number)], strict=True)):
                 where = f"story {number}, after {[kind for kind, _ in done[:step]]}: {list(content)}"
-                np.testing.assert_array_equal(live, fresh, err_msg=where)
+                assert_array_equal(live, fresh, err_msg=where)
 
 
-def test_an_integrator_may_serve_several_scenes() -> None:
+def test_an_integrator_may_serve_several_scenes():
     """Of the same loaded objects, or alike but for a property that is no array."""
     integrator = mi.load_dict({"type": "mrt_whitted"})
     schlick, exact = (mi.load_dict(content(name)) for name in ("schlick", "dielectric"))
@@ -76,14 +77,15 @@ def test_an_integrator_may_serve_several_scenes() -> None:
     again = mi.load_dict({"type": "scene", "sensor": exact.sensors()[0], "sky": exact.environment(), **both})
     for scene in (schlick, exact, again, exact, schlick, again):
         expected = picture(scene, mi.load_dict({"type": "mrt_whitted"}))
-        np.testing.assert_array_equal(picture(scene, integrator), expected)
+        assert_array_equal(picture(scene, integrator), expected)
 
 
 @pytest.mark.parametrize("loaded", [True, False])
-def test_a_prepared_scene_gives_what_render_gives(loaded: bool) -> None:
+def test_a_prepared_scene_gives_what_render_gives(loaded):
     options = {"width": 16, "height": 12, "aa": 1 if loaded else 2, "aamode": "none"}
     nodes = mrt.scene_dict(3)
-    again, other = mrt.prepare(mi.load_dict(nodes), **options), mi.load_dict(nodes)
+    again = mrt.prepare(mi.load_dict(nodes), **options)
+    other = mi.load_dict(nodes)
     parameters = mi.traverse(other)
     keys = [key for key in parameters.keys() if key.endswith("reflectance.value")]  # noqa: SIM118
     for seed, value in enumerate((0.0, 0.3, 0.9)):
@@ -91,10 +93,22 @@ def test_a_prepared_scene_gives_what_render_gives(loaded: bool) -> None:
             again.params[key] = parameters[key] = mi.Color3f(value, 0.5 * value, 0.2 * value)
         parameters.update()
         expected = mrt.render(other, seed=seed, **options).image
-        np.testing.assert_array_equal(again(seed=seed).image, expected)
+        assert_array_equal(again(seed=seed).image, expected)
 
 
-def test_lists_around_the_eye_follow_the_camera() -> None:
+@pytest.mark.parametrize(("name", "value"), [("max_depth", 2), ("clamp", False), ("min_contribution", 0.3)])
+def test_a_prepared_scene_follows_its_integrator(name, value):
+    options = {"width": 16, "height": 12, "aa": 1, "aamode": "none"}
+    scene = mi.load_dict(mrt.scene_dict(3))
+    again = mrt.prepare(scene, **options)
+    before = again().image
+    setattr(scene.integrator(), name, value)
+    after = again().image
+    assert (after != before).any()
+    assert_array_equal(after, mrt.render(scene, **options).image)
+
+
+def test_lists_around_the_eye_follow_the_camera():
     """Whichever camera looks and however it moves, the picture is that of a search; trees are made once."""
     ends = np.random.default_rng(2).uniform(-1, 1, (80, 6))
     nodes = {name: node for name, node in content("schlick").items() if name in ("light", "sky", "floor")}
@@ -104,23 +118,26 @@ def test_lists_around_the_eye_follow_the_camera() -> None:
     scene = mi.load_dict({"type": "scene", "first": views[0], "other": views[1], **nodes})
     lists, search = (mi.load_dict({"type": "mrt_whitted", "max_depth": 1}) for _ in range(2))
     search.kernel_plan = lambda facts: replace(lists.kernel_plan(facts), eye=False)
-    trees, again, parameters = lists.prepare(scene).quadrics, mrt.prepare(scene, **size), mi.traverse(scene)
-    color, slopes = "crowd.bsdf.diffuse_reflectance.value", []
+    trees = lists.prepare(scene).quadrics
+    again = mrt.prepare(scene, **size)
+    parameters = mi.traverse(scene)
+    color = "crowd.bsdf.diffuse_reflectance.value"
+    slopes = []
     for x in (0, 0.1, 3):
         parameters["first.to_world"] = mi.Transform4f().look_at([x, 1, 4], [0, 0, 0], [0, 1, 0])
         parameters.update()
         for view in (0, 1, 0):
             pictures = [mi.render(scene, integrator=way, sensor=view, spp=4) for way in (lists, search)]
-            np.testing.assert_array_equal(*map(np.array, pictures))
+            assert_array_equal(*map(np.array, pictures))
         data = lists.prepare(scene)
         assert data.quadrics is trees
-        np.testing.assert_allclose(np.ravel(data.eye.place), (x, 1, 4))
-        np.testing.assert_array_equal(again().image, mrt.render(scene, **size).image)
+        assert_allclose(np.ravel(data.eye.place), (x, 1, 4))
+        assert_array_equal(again().image, mrt.render(scene, **size).image)
     for way in (lists, search):
         dr.enable_grad(parameters[color])
         dr.backward(dr.sum(mi.render(scene, parameters, integrator=way, spp=4)))
         slopes.append(np.array(dr.grad(parameters[color])))
         parameters[color] = dr.detach(parameters[color])
         parameters.update()
-    np.testing.assert_allclose(*slopes, rtol=1e-5)
+    assert_allclose(*slopes, rtol=1e-5)
     assert slopes[0].all()

@@ -7,18 +7,18 @@ import math
 import re
 import struct
 import zlib
-from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from nodes import example
 from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.plugins.table import PLUGINS
 from mrt_mitsuba.scene.open import open_scene
 
 pytestmark = [pytest.mark.fuzz, pytest.mark.filterwarnings("ignore::mrt_mitsuba.errors.MrtWarning")]
@@ -49,19 +49,16 @@ WORDS_OF_XML = """
     texture spectrum boolean translate scale id name < > & &amp; &b; ' " <!-- ]]> <a/>
 """
 WORDS = [*WORDS_OF_XML.split(), "", "1 2", "0 0 0", "<scene version='3.0.0'/>", "\0", "\n"]
+ANY_WORD = st.sampled_from(WORDS) | st.text(max_size=8)
 PARTS = re.split(r"([ <>=/'])", WHOLE)
 
 
 @one_folder
 @given(
-    changes=st.dictionaries(
-        st.integers(0, len(PARTS) - 1), st.one_of(st.sampled_from(WORDS), st.text(max_size=8)), max_size=4
-    ),
-    cut=st.one_of(st.none(), st.integers(0, len(PARTS))),
+    changes=st.dictionaries(st.integers(0, len(PARTS) - 1), ANY_WORD, max_size=4),
+    cut=st.none() | st.integers(0, len(PARTS)),
 )
-def test_any_scene_file_is_read_or_refused(
-    tmp_path: Path, variant: str, changes: dict[int, str], cut: int | None
-) -> None:
+def test_any_scene_file_is_read_or_refused(tmp_path, variant, changes, cut):
     parts = [changes.get(i, part) for i, part in enumerate(PARTS[:cut])]
     path = tmp_path / "a.xml"
     path.write_bytes("".join(parts).encode(errors="surrogatepass"))
@@ -71,22 +68,20 @@ def test_any_scene_file_is_read_or_refused(
         assert "a.xml" in str(error) or "integrator" in str(error)
         assert "Traceback" not in str(error)
         return
-    assert source.width > 0 and source.height > 0 and source.sensor is not None
+    assert source.width > 0
+    assert source.height > 0
+    assert source.sensor is not None
 
 
 NUMBERS = [i for i, part in enumerate(PARTS) if part.replace(".", "").replace(",", "").isdigit()]
 
 
+EXTREMES = ["0", "1", "-1", "1e-30", "1e-9", "1e5", "1e20", "3e38", "0.5", "2"]
+
+
 @settings(one_folder, max_examples=60)  # each is compiled
-@given(
-    changes=st.dictionaries(
-        st.sampled_from(NUMBERS),
-        st.sampled_from(["0", "1", "-1", "1e-30", "1e-9", "1e5", "1e20", "3e38", "0.5", "2"]),
-        min_size=1,
-        max_size=3,
-    )
-)
-def test_any_scene_file_that_is_read_is_drawn(tmp_path: Path, variant: str, changes: dict[int, str]) -> None:
+@given(changes=st.dictionaries(st.sampled_from(NUMBERS), st.sampled_from(EXTREMES), min_size=1, max_size=3))
+def test_any_scene_file_that_is_read_is_drawn(tmp_path, variant, changes):
     """Whatever its numbers, the picture is made of numbers, or one clear error says why there is none."""
     path = tmp_path / "a.xml"
     path.write_text("".join(changes.get(i, part) for i, part in enumerate(PARTS)))
@@ -105,7 +100,8 @@ PNG = _stream.getvalue()
 
 def _mended(data: bytes) -> bytes:
     """Return the chunks with right checksums, so that faults in their content are reached."""
-    result, at = data[:8], 8
+    result = data[:8]
+    at = 8
     while at + 12 <= len(data):
         (length,) = struct.unpack(">I", data[at : at + 4])
         body = data[at + 4 : at + 8 + min(length, len(data))]
@@ -117,15 +113,14 @@ def _mended(data: bytes) -> bytes:
 @one_folder
 @given(
     changes=st.dictionaries(st.integers(0, len(PNG) - 1), st.integers(0, 255), max_size=4),
-    cut=st.one_of(st.none(), st.integers(0, len(PNG))),
+    cut=st.none() | st.integers(0, len(PNG)),
     mend=st.booleans(),
 )
-def test_any_picture_is_read_or_refused(
-    tmp_path: Path, variant: str, changes: dict[int, int], cut: int | None, mend: bool
-) -> None:
+def test_any_picture_is_read_or_refused(tmp_path, variant, changes, cut, mend):
     data = bytes(changes.get(i, byte) for i, byte in enumerate(PNG[:cut]))
     # Two of the four bytes of width and height: 65535 x 65535 would fit no memory, before anything is read
-    data = data[:16] + bytes(len(data[16:18])) + data[18:20] + bytes(len(data[20:22])) + data[22:]
+    high_bytes = (16, 17, 20, 21)
+    data = bytes(0 if i in high_bytes else byte for i, byte in enumerate(data))
     path = tmp_path / "p.png"
     path.write_bytes(_mended(data) if mend else data)
     try:
@@ -136,36 +131,29 @@ def test_any_picture_is_read_or_refused(
         assert min(texture.resolution()) > 0
 
 
-PARAMETERS: dict[str, dict[str, Any]] = {
-    "mrt_bsdf": {"alpha": 0.1, "int_ior": 1.5, "ext_ior": 1.0, "fresnel": "schlick", "f0": 0.04}
-    | {"diffuse_reflectance": 0.5, "specular_reflectance": 1.0},
-    "mrt_cone": {"apex": [0, 0, 1], "base_center": [0, 0, 0], "radius": 1.0, "capped": True, "segments": 8},
-    "mrt_cylinder": {"p0": [0, 0, 1], "p1": [0, 0, 0], "radius": 1.0, "capped": True, "segments": 8},
-    "mrt_light": {"position": [0, 0, 1], "intensity": 1.0},
-    "mrt_plane": {"normal": [0, 0, 1], "distance": 0.0, "extent": 1.0},
-    "mrt_texture": {"filename": "none.png"},
-    "mrt_whitted": {"max_depth": 3, "clamp": True, "min_contribution": 0.0, "sky": 1.0}
-    | {"bounce_budget": "plain"},
-}
+AXIAL = {"radius": 1.0, "capped": True, "segments": 8}
+OPTIONAL = {"mrt_cone": AXIAL, "mrt_cylinder": AXIAL, "mrt_light": {"position": [0, 0, 1], "intensity": 1.0}}
+OPTIONAL["mrt_bsdf"] = {"alpha": 0.1, "int_ior": 1.5, "ext_ior": 1.0, "fresnel": "schlick", "f0": 0.04}
+OPTIONAL["mrt_bsdf"] |= {"diffuse_reflectance": 0.5, "specular_reflectance": 1.0}
+OPTIONAL["mrt_plane"] = {"distance": 0.0, "extent": 1.0}
+OPTIONAL["mrt_whitted"] = {"max_depth": 3, "clamp": True, "min_contribution": 0.0, "sky": 1.0}
+OPTIONAL["mrt_whitted"] |= {"bounce_budget": "plain"}
 numbers = st.one_of(st.floats(width=32), st.floats(), st.sampled_from([0.0, -1.0, 1e39, math.nan, math.inf]))
-values = st.one_of(
-    numbers,
-    st.booleans(),
-    st.integers(-3, 300),
-    st.text(max_size=6),
-    st.lists(numbers, min_size=3, max_size=3),
-    st.builds(lambda x: {"type": "rgb", "value": [x, 0.5, 0.5]}, numbers),
-)
+vectors = st.lists(numbers, min_size=3, max_size=3)
+colors = st.builds(lambda x: {"type": "rgb", "value": [x, 0.5, 0.5]}, numbers)
+simple = st.booleans() | st.integers(-3, 300) | st.text(max_size=6)
+values = numbers | simple | vectors | colors
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_any_parameter_is_taken_or_refused_by_name(variant: str, data: st.DataObject) -> None:
-    plugin = data.draw(st.sampled_from(sorted(PARAMETERS)))
-    name = data.draw(st.sampled_from(sorted(PARAMETERS[plugin])))
-    parameters = {**PARAMETERS[plugin], name: data.draw(values)}
+def test_any_parameter_is_taken_or_refused_by_name(variant, data):
+    row = data.draw(st.sampled_from(PLUGINS))
+    plugin = row.name
+    optional = OPTIONAL.get(plugin, {})
+    name = data.draw(st.sampled_from(sorted({*row.sample, *optional})))
     try:
-        mi.load_dict({"type": plugin, **parameters})
+        mi.load_dict(example(row, **{**optional, name: data.draw(values)}))
     except (RuntimeError, TypeError) as error:
         text = str(error)
         assert plugin in text or name in text

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cases import Cases
 
 import mrt_mitsuba as mrt
 
@@ -24,7 +25,8 @@ SCENE = """<scene version="3.0.0">
   <shape type="rectangle"><emitter type="area"><rgb name="radiance" value="9"/></emitter>
     <transform name="to_world"><rotate x="1" angle="90"/><translate y="3" z="3"/></transform></shape>
 </scene>"""
-PATH, PRB = '<integrator type="path"/>', '<integrator type="prb"/>'
+PATH = '<integrator type="path"/>'
+PRB = '<integrator type="prb"/>'
 AOV = '<integrator type="aov"><string name="aovs" value="far:depth"/><integrator type="path"/></integrator>'
 CROP = '<integer name="crop_width" value="9"/><integer name="crop_offset_x" value="7"/>'
 RGBA = '<string name="pixel_format" value="rgba"/><rfilter type="box"/>'
@@ -39,20 +41,17 @@ def rms(values: Any) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.parametrize(
-    ("nested", "film", "channels"),
-    [
-        (PATH, "", ["R", "G", "B", "error.Y", "samples.Y"]),
-        (PATH, CROP + GREY, ["Y", "error.Y", "samples.Y"]),
-        (PATH, RGBA, ["R", "G", "B", "A", "error.Y", "samples.Y"]),
-        (PRB, "", ["R", "G", "B", "error.Y", "samples.Y"]),
-        ('<integrator type="ptracer"/>', "", ["R", "G", "B", "error.Y", "samples.Y"]),
-        (AOV, CROP + RGBA, None),
-    ],
-)
-def test_the_film_of_a_scene_is_filled_to_an_error(
-    nested: str, film: str, channels: list[str] | None
-) -> None:
+films = Cases()
+films(PATH, "", ["R", "G", "B", "error.Y", "samples.Y"])
+films(PATH, CROP + GREY, ["Y", "error.Y", "samples.Y"])
+films(PATH, RGBA, ["R", "G", "B", "A", "error.Y", "samples.Y"])
+films(PRB, "", ["R", "G", "B", "error.Y", "samples.Y"])
+films('<integrator type="ptracer"/>', "", ["R", "G", "B", "error.Y", "samples.Y"])
+films(AOV, CROP + RGBA, None)
+
+
+@pytest.mark.parametrize(("nested", "film", "channels"), films)
+def test_the_film_of_a_scene_is_filled_to_an_error(nested, film, channels):
     scene = scene_with(nested, film)
     adaptive = scene.integrator()
     picture = np.array(mi.render(scene, seed=3))
@@ -63,31 +62,37 @@ def test_the_film_of_a_scene_is_filled_to_an_error(
         assert np.array_equal(np.atleast_3d(bitmap)[..., channel], picture[..., channel])
     stock = np.array(mi.render(scene, integrator=adaptive.nested, spp=2048))
     kept = stock.shape[-1]
-    assert picture.shape == (*stock.shape[:2], kept + 2) and names[-2:] == ["error.Y", "samples.Y"]
-    error, samples = picture[..., -2], picture[..., -1]
+    assert picture.shape == (*stock.shape[:2], kept + 2)
+    assert names[-2:] == ["error.Y", "samples.Y"]
+    error = picture[..., -2]
+    samples = picture[..., -1]
     colors = len([name for name in names[:kept] if name in "RGBY"])
-    assert rms(picture[..., :colors] - stock[..., :colors]) < 0.03 and 0 < rms(error) < 0.03
+    assert rms(picture[..., :colors] - stock[..., :colors]) < 0.03
+    assert 0 < rms(error) < 0.03
     assert kept == colors or rms(picture[..., colors:kept] - stock[..., colors:kept]) < 0.2
     assert samples.mean() > 8
 
 
-def test_rays_are_bounded_and_seeds_matter() -> None:
+def test_rays_are_bounded_and_seeds_matter():
     scene = scene_with()
     few, more = (np.array(mi.render(scene, spp=spp)) for spp in (16, 128))
     assert 8 <= few[..., -1].mean() <= 16 < more[..., -1].mean() <= 128
     again, other = (np.array(scene.integrator().render(scene, seed=seed, spp=16)) for seed in (0, 1))
-    assert np.array_equal(few, again) and not np.array_equal(few, other)
+    assert np.array_equal(few, again)
+    assert not np.array_equal(few, other)
     fixed = mi.load_dict({"type": "mrt_adaptive", "spp": 48, "inner": {"type": "path"}})
     spent = np.array(mi.render(scene, integrator=fixed))[..., -1]
-    assert 40 <= spent.mean() <= 48 and spent.std() > 0
+    assert 40 <= spent.mean() <= 48
+    assert spent.std() > 0
     with pytest.warns(UserWarning, match="takes 8 rays a pixel at least, not spp=4"):
         assert np.array(mi.render(scene, spp=4))[..., -1].mean() == 8
 
 
 @pytest.mark.filterwarnings("ignore::mrt_mitsuba.MrtWarning")
 @pytest.mark.parametrize("nested", [PATH, PRB])
-def test_derivatives_are_those_of_the_nested_integrator(nested: str) -> None:
-    scene, key = scene_with(nested), "ball.bsdf.reflectance.value"
+def test_derivatives_are_those_of_the_nested_integrator(nested):
+    scene = scene_with(nested)
+    key = "ball.bsdf.reflectance.value"
     params = mi.traverse(scene)
     found = []
     for integrator in (scene.integrator(), scene.integrator().nested):
@@ -97,17 +102,19 @@ def test_derivatives_are_those_of_the_nested_integrator(nested: str) -> None:
         dr.backward(dr.mean(picture[..., :3]))
         found.append(np.array(dr.grad(params[key])).ravel())
         dr.set_grad(params[key], 0)
-    assert np.allclose(*found, rtol=1e-4) and (found[0] > 0).all()
+    assert np.allclose(*found, rtol=1e-4)
+    assert (found[0] > 0).all()
 
 
-def test_files_and_the_command_know_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_and_the_command_know_it(tmp_path, monkeypatch):
     from mrt_mitsuba.command.main import main
 
     monkeypatch.chdir(tmp_path)
     Path("a.xml").write_text(SCENE.format(nested=PATH, film=""))
     picture = np.array(mi.render(mi.load_file("a.xml"), seed=1))
     result = mrt.render("a.xml", seed=1)
-    assert np.allclose(result.image, picture[..., :3], atol=1e-6) and result.error.rmse < 0.03
+    assert np.allclose(result.image, picture[..., :3], atol=1e-6)
+    assert result.error.rmse < 0.03
     assert main(["out", "scene=a.xml"]) == 0
     assert list(mi.Bitmap("out.exr").size()) == [24, 16]
 
@@ -115,21 +122,26 @@ def test_files_and_the_command_know_it(tmp_path: Path, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     "name", ["prb", "prb_basic", "prbvolpath", "direct_projective", "prb_projective", "ptracer"]
 )
-def test_every_integrator_gives_pictures_with_their_error(name: str) -> None:
-    scene, integrator = scene_with(), mi.load_dict({"type": name})
+def test_every_integrator_gives_pictures_with_their_error(name):
+    scene = scene_with()
+    integrator = mi.load_dict({"type": name})
     stock = np.array(mi.render(scene, integrator=integrator, spp=1024))[..., :3]
     assert rms(mrt.render(scene, integrator=integrator, spp=256).image - stock) < 0.1
     result = mrt.render(scene, integrator=integrator, target=0.05, maxspp=512)
-    assert rms(result.image - stock) < 0.1 and 0 < result.error.low < result.error.rmse < 0.08
-    assert result.rounds[-1].rmse == result.error.rmse and result.error.high > result.error.rmse
+    assert rms(result.image - stock) < 0.1
+    assert 0 < result.error.low < result.error.rmse < 0.08
+    assert result.rounds[-1].rmse == result.error.rmse
+    assert result.error.high > result.error.rmse
 
 
-def test_scalar_variants_follow_the_film() -> None:
+def test_scalar_variants_follow_the_film():
     film = {"type": "hdrfilm", "width": 6, "height": 4}
     scene = {"type": "scene", "sensor": {"type": "perspective", "film": film}}
     scene |= {"light": {"type": "constant"}, "ball": {"type": "sphere", "center": [0, 0, 4]}}
     result = mrt.render(scene, integrator="path", variant="scalar_rgb", target=0.1, maxspp=32)
-    assert result.image.shape == (4, 6, 3) and result.error.rmse < 0.1
+    assert result.image.shape == (4, 6, 3)
+    assert result.error.rmse < 0.1
     inside = {"type": "mrt_adaptive", "target": 0.1, "max_spp": 32, "nested": {"type": "path"}}
     picture = np.array(mi.render(mi.load_dict(scene), integrator=mi.load_dict(inside)))
-    assert picture.shape == (4, 6, 5) and picture[..., -1].max() > 8
+    assert picture.shape == (4, 6, 5)
+    assert picture[..., -1].max() > 8

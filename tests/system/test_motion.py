@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.rays.film import Places
@@ -40,10 +41,11 @@ def _times(aa: int = 4, repeats: int = 1, **shutter) -> np.ndarray:
 def test_every_ray_of_a_pixel_has_a_part_of_the_time_of_its_own(aa, repeats, seed):
     moments = aa**2 * repeats
     times = _times(aa=aa, repeats=repeats, moments=moments, phase=None, seed=seed)
-    assert times.min() >= 0 and times.max() <= 1
+    assert times.min() >= 0
+    assert times.max() <= 1
     within = (times * moments % 1).mean(axis=1, keepdims=True)
     parts = np.sort(np.floor(times * moments - within + 0.5), axis=1)
-    np.testing.assert_array_equal(parts - parts[:, :1], np.tile(np.arange(moments), (64, 1)))
+    assert_array_equal(parts - parts[:, :1], np.tile(np.arange(moments), (64, 1)))
 
 
 @pytest.mark.parametrize("aa", [3, 4, 5, 8])
@@ -78,7 +80,8 @@ def test_frames_are_the_mean_of_renders_from_shifted_cameras(options):
     frames = [mrt.render(_shifted(0, np.multiply(WAY, k / 3)), **{**SMALL, **options}) for k in range(3)]
     difference = np.abs(blurred.image - np.mean([frame.image for frame in frames], axis=0))
     # the same rays up to float32 rounding of their origins; an edge that flips in a pixel would be 5e-5
-    assert np.median(difference) < 1e-6 and difference.mean() < 2e-5
+    assert np.median(difference) < 1e-6
+    assert difference.mean() < 2e-5
     assert blurred.rays["primary"] == pytest.approx(sum(frame.rays["primary"] for frame in frames), rel=1e-3)
 
 
@@ -126,7 +129,7 @@ def test_a_detector_sees_no_noise_in_a_stratified_picture():
     assert 0 < refined.sum() < refined.size
     assert result.rays["primary"] == 8 * 96 * 72 + refined.sum() * 3 * 3  # three samples, at nine moments
     other_seed = mrt.render(0, **options, aamode="luma", seed=5)
-    np.testing.assert_array_equal(result.layers["edges.Y"], other_seed.layers["edges.Y"])
+    assert_array_equal(result.layers["edges.Y"], other_seed.layers["edges.Y"])
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cases import Cases
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.output import LAYERS
@@ -36,7 +38,8 @@ def test_rays_are_counted_as_the_scene_tells():
     ball = {**nodes["sphere_0"], "bsdf": {"type": "mrt_bsdf", "specular_reflectance": 0.0}}
     result = mrt.render({**kept, "ball": ball}, aa=1, aamode="none", count_rays=True, layers=["depth"])
     hits = np.isfinite(result.layers["depth.Z"]).sum()
-    assert result.rays["mirror"] == 0 and 0 < result.rays["shadow"] < hits
+    assert result.rays["mirror"] == 0
+    assert 0 < result.rays["shadow"] < hits
 
 
 def test_slow_variants_are_warned_of_once_in_a_process(run_python):
@@ -48,7 +51,7 @@ def test_slow_variants_are_warned_of_once_in_a_process(run_python):
 def test_a_region_in_a_scalar_variant():
     options = {"width": 12, "height": 9, "aa": 2, "focalrange": 0.5, "variant": "scalar_rgb"}
     whole = mrt.render(3, **options).image
-    np.testing.assert_array_equal(mrt.render(3, region=(3, 4, 7, 3), **options).image, whole[4:7, 3:10])
+    assert_array_equal(mrt.render(3, region=(3, 4, 7, 3), **options).image, whole[4:7, 3:10])
 
 
 def test_scene_numbers_dicts_and_mitsuba_scenes_agree():
@@ -116,15 +119,17 @@ def test_other_variants_show_the_same_scene(other_variant):
     assert (other @ weights).mean() == pytest.approx((rgb @ weights).mean(), rel=0.05)
 
 
+layers = Cases()
+layers({}, {"error", "variance"})
+layers({"aamode": "none"}, {"error", "variance", "edges"})
+layers({"target": 0.1}, {"edges"})
+layers({"aamode": "noise", "lattice": "film", "spp": 16}, {"edges"})
+layers({"integrator": "direct"}, {"error", "variance", "direct", "reflection", "bounces"})
+
+
 @pytest.mark.parametrize(
     ("options", "missing"),
-    [
-        ({}, {"error", "variance"}),
-        ({"aamode": "none"}, {"error", "variance", "edges"}),
-        ({"target": 0.1}, {"edges"}),
-        ({"aamode": "noise", "lattice": "film", "spp": 16}, {"edges"}),
-        ({"integrator": "direct"}, {"error", "variance", "direct", "reflection", "bounces"}),
-    ],
+    layers,
     ids=lambda x: ",".join(sorted(x)),
 )
 def test_all_layers_are_those_that_can_be_made(options, missing):
@@ -145,10 +150,10 @@ def test_layers_belong_together():
     channels = mrt.render(3, **SMALL, aa=2, aamode="none", layers=layers).layers
     total = np.stack([channels[f"direct.{c}"] + channels[f"reflection.{c}"] for c in "RGB"], -1)
     unblurred = mrt.render(3, **SMALL, aa=2, aamode="none", focaldist=0).image
-    np.testing.assert_allclose(total, unblurred, atol=1e-6)
+    assert_allclose(total, unblurred, atol=1e-6)
     length = np.sqrt(sum(channels[f"normal.{c}"] ** 2 for c in "XYZ"))
     hit = np.isfinite(channels["depth.Z"])
-    np.testing.assert_allclose(length[hit], 1, atol=1e-6)
+    assert_allclose(length[hit], 1, atol=1e-6)
     assert np.all(length[~hit] == 0)
     assert channels["bounces.Y"].max() > 1
 
@@ -161,3 +166,13 @@ def test_depth_is_the_distance_from_the_eye():
     depth = result.layers["depth.Z"]
     assert depth[37, 50] == pytest.approx(1 / descent, rel=1e-6)
     assert np.isinf(depth[0]).all()  # the sky
+
+
+@pytest.mark.parametrize("aa", [2, 3, 4])
+def test_samples_of_the_centered_lattice_are_the_centres_of_smaller_pixels(aa):
+    options = {"aamode": "none", "lattice": "centered", "focaldist": 0}
+    coarse = mrt.render(1, width=40, height=30, aa=aa, **options).image
+    fine = mrt.render(1, width=40 * aa, height=30 * aa, aa=1, **options).image
+    expected = fine.reshape(30, aa, 40, aa, 3).mean((1, 3))
+    # the same rays, but for roundings that move one across an edge here and there
+    assert np.quantile(np.abs(coarse - expected), 0.99) < 1e-4

@@ -19,8 +19,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from cases import Cases
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba import runtime
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
 from mrt_mitsuba.machine import usable_cores
@@ -32,6 +34,7 @@ pytestmark = pytest.mark.attack
 
 SMALL = {"width": 64, "height": 48, "aa": 1}
 ROUNDS = int(os.environ.get("MRT_ATTACK_ROUNDS", "1"))
+NOWHERE = "tcp://127.0.0.1:9"  # no scheduler is there
 PATIENCE = 120  # seconds for anything that processes do; a busy machine is no failure
 
 
@@ -50,7 +53,9 @@ class Cluster:
     """A scheduler and two workers, started by hand; ``preload``: Python code that each worker runs first."""
 
     def __init__(self, folder: Path, preload: str = "", *words: str) -> None:
-        self.folder, self.words, self.workers = folder, words, []
+        self.folder = folder
+        self.words = words
+        self.workers = []
         (folder / "preload.py").write_text(preload)
         self.start_scheduler()
         self.start_workers()
@@ -129,7 +134,7 @@ def written(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> None:
+def test_pictures_are_those_of_render_alone(address, tmp_path):
     """All combinations of options, seeds and scenes: a number, a dict with Mitsuba's types, a file; of two
     workers each takes half of the machine's cores."""
     mrt.register()
@@ -139,20 +144,26 @@ def test_pictures_are_those_of_render_alone(address: str, tmp_path: Path) -> Non
     with Client(address, set_as_default=False) as client:
         table = mrt.sweep(None, tmp_path / "out", grid=grid, cluster=client, layers=["depth"])
         threads = client.run(lambda: dr.thread_count())
-    assert {threads[row["worker"]] for row in table.rows} == {max(1, usable_cores() // 2)}
-    assert len(table.rows) == 12 and not table.failed and not left_over(tmp_path / "out")
+    half = max(1, usable_cores() // 2)
+    assert {threads[row["worker"]] for row in table.rows} == {half}
+    assert len(table.rows) == 12
+    assert not table.failed
+    assert not left_over(tmp_path / "out")
     for row in table.rows:
         alone = mrt.render(row["scene"], aa=row["aa"], seed=row["seed"], layers=["depth"])
         found = read_exr(tmp_path / "out" / row["file"])
         assert found.image.tobytes() == alone.image.tobytes()
         assert found.layers.keys() == alone.layers.keys()
-        assert row["attempts"] == 1 and row["seconds"] > 0 and row["rays"] == sum(alone.rays.values())
-    assert [row["file"] for row in table.rows][:2] == ["scene=3,aa=1,seed=0.exr", "scene=3,aa=1,seed=1.exr"]
-    assert [row["file"] for row in written(tmp_path / "out")] == [row["file"] for row in table.rows]
+        assert row["attempts"] == 1
+        assert row["seconds"] > 0
+        assert row["rays"] == sum(alone.rays.values())
+    files = [row["file"] for row in table.rows]
+    assert files[:2] == ["scene=3,aa=1,seed=0.exr", "scene=3,aa=1,seed=1.exr"]
+    assert [row["file"] for row in written(tmp_path / "out")] == files
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb"], indirect=True)
-def test_workers_use_the_callers_variant(variant: str, address: str, tmp_path: Path) -> None:
+def test_workers_use_the_callers_variant(variant, address, tmp_path):
     mrt.sweep(3, tmp_path, cluster=address, width=8, height=6)
     assert read_exr(tmp_path / "picture.exr").header["mrt:variant"] == variant
 
@@ -169,28 +180,27 @@ CROSSED = {"params": [{"resx": 40}, {"resx": 50}], "material_0.alpha": [0.1]}
         (False, CROSSED, [f"params=resx-{n},material_0.alpha=0.1" for n in (40, 50)]),
     ],
 )
-def test_parameters_of_the_scene(
-    address: str, tmp_path: Path, zipped: bool, grid: dict[str, Any], names: list[str]
-) -> None:
+def test_parameters_of_the_scene(address, tmp_path, zipped, grid, names):
     """Those of ``mi.traverse`` and those that a file declares; frames are numbered for films."""
-    mine, out = tmp_path / "mine.xml", tmp_path / "out"
+    mine = tmp_path / "mine.xml"
+    out = tmp_path / "out"
     assert cli.main(["export", "3", "--xml", str(mine)]) == 0
     scene, size = (3, SMALL) if zipped else (mine, {"aa": 1})
     table = mrt.sweep(scene, out, grid=grid, cluster=address, zipped=zipped, png=True, **size)
     assert [row["file"] for row in table.rows] == [f"{name}.exr" for name in names]
     assert sorted(path.stem for path in out.glob("*.png")) == names
     for row in table.rows:
-        params = {key: value for key, value in row.items() if "." in key} | row.get("params", {})
+        keys = {key: value for key, value in row.items() if "." in key}
+        params = keys | row.get("params", {})
         alone = mrt.render(scene, params=params, focaldist=row.get("focaldist"), **size)
         assert read_exr(out / row["file"]).image.tobytes() == alone.image.tobytes()
 
 
-def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(
-    address: str, tmp_path: Path
-) -> None:
+def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(address, tmp_path):
     def run(**options: Any) -> dict[str, int]:
         table = mrt.sweep(3, tmp_path, grid={"seed": [1, 2]}, cluster=address, png=True, **SMALL | options)
-        assert len(table.rows) == 2 and not table.failed
+        assert len(table.rows) == 2
+        assert not table.failed
         assert all(row["seconds"] > 0 and row["attempts"] == 1 for row in table.rows)
         return made(tmp_path)
 
@@ -198,27 +208,40 @@ def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(
     assert run(memory="1G") == first  # memory does not decide about pixels
     (tmp_path / "seed=1.exr").unlink()
     second = run()
-    assert {name for name in first if first[name] != second[name]} == {"seed=1.exr", "seed=1.png"}
+    made_again = {name for name in first if first[name] != second[name]}
+    assert made_again == {"seed=1.exr", "seed=1.png"}
     third = run(fresnel="dielectric")
     assert not set(second.values()) & set(third.values())
-    assert not set(third.values()) & set(run(fresnel="dielectric", resume=False).values())
+    fourth = run(fresnel="dielectric", resume=False)
+    assert not set(third.values()) & set(fourth.values())
 
 
-def test_a_picture_that_was_cut_is_made_again(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd
-) -> None:
+def test_pictures_of_another_version_are_made_again(address, tmp_path, monkeypatch):
+    """The sweep comes so far as to look for workers."""
+    mrt.sweep(3, tmp_path, cluster=address, **SMALL)
+    monkeypatch.setattr("mrt_mitsuba.sweeps.cluster.CONNECTING", 0.2)
+    assert not mrt.sweep(3, tmp_path, cluster=NOWHERE, **SMALL).failed
+    monkeypatch.setattr(mrt, "__version__", "0.0.1")
+    runtime.versions.cache_clear()
+    try:
+        with pytest.raises(MrtError, match="no scheduler with workers answers"):
+            mrt.sweep(3, tmp_path, cluster=NOWHERE, **SMALL)
+    finally:
+        runtime.versions.cache_clear()
+
+
+def test_a_picture_that_was_cut_is_made_again(address, tmp_path, monkeypatch, capfd):
     """At every kilobyte: the sweep comes so far as to look for workers."""
     options: dict[str, Any] = {"grid": {"seed": [1]}, "png": True, "width": 32, "height": 16, "aa": 1}
     mrt.sweep(3, tmp_path, cluster=address, **options)
     monkeypatch.setattr("mrt_mitsuba.sweeps.cluster.CONNECTING", 0.2)
-    nowhere = {"cluster": "tcp://127.0.0.1:9"}
-    assert not mrt.sweep(3, tmp_path, **nowhere, **options).failed  # whole, and none is needed
+    assert not mrt.sweep(3, tmp_path, cluster=NOWHERE, **options).failed  # whole, and none is needed
     for file in (tmp_path / "seed=1.exr", tmp_path / "seed=1.png"):
         whole = file.read_bytes()
         for length in range(0, len(whole), 1024):
             file.write_bytes(whole[:length])
             with pytest.raises(MrtError, match="no scheduler with workers answers"):
-                mrt.sweep(3, tmp_path, **nowhere, **options)
+                mrt.sweep(3, tmp_path, cluster=NOWHERE, **options)
         file.write_bytes(whole)
     assert capfd.readouterr() == ("", "")  # nothing of what libraries print about broken files
 
@@ -227,10 +250,13 @@ def test_a_picture_that_was_cut_is_made_again(
     "name",
     ["table.csv", "table.csv/", "seed=1.exr", "seed=1.png", "link", "own.png", "picture.tiles/0,0.exr"],
 )
-def test_a_file_of_the_users_own_is_refused_by_name(address: str, tmp_path: Path, name: str) -> None:
-    mine = tmp_path / {"link": "seed=1.exr", "own.png": "seed=1.png"}.get(name, name)
+def test_a_file_of_the_users_own_is_refused_by_name(address, tmp_path, name):
+    stands_for = {"link": "seed=1.exr", "own.png": "seed=1.png"}
+    mine = tmp_path / stands_for.get(name, name)
     mine.parent.mkdir(exist_ok=True)
-    options: dict[str, Any] = {"tiles": (1, 2)} if "tiles" in name else {"grid": {"seed": [1]}, "png": True}
+    options: dict[str, Any] = {"grid": {"seed": [1]}, "png": True}
+    if "tiles" in name:
+        options = {"tiles": (1, 2)}
     if name == "own.png":  # next to a picture that a sweep made
         mrt.sweep(3, tmp_path, grid={"seed": [1]}, cluster=address, **SMALL)
     if name == "link":
@@ -264,65 +290,80 @@ api.render = render
 """
 
 
-def test_a_scene_file_counts_by_its_contents(address: str, mortal, tmp_path: Path) -> None:
+def test_a_scene_file_counts_by_its_contents(address, mortal, tmp_path):
     """Two versions in one folder after each other, two at a time, and a change while it is rendered."""
-    scene, out = tmp_path / "mine.xml", tmp_path / "out"
+    scene = tmp_path / "mine.xml"
+    out = tmp_path / "out"
     assert cli.main(["export", "0", "--xml", str(scene)]) == 0
     options: dict[str, Any] = {"cluster": address, **SMALL}
     first = mrt.sweep(scene, out, **options).rows[0]
     scene.write_text(scene.read_text().replace('value="60"', 'value="50"'))
     second = mrt.sweep(scene, out, **options).rows[0]
-    assert second != first and read_exr(out / "picture.exr").header["mrt:sweep"]
+    assert second != first
+    assert read_exr(out / "picture.exr").header["mrt:sweep"]
     assert read_exr(out / "picture.exr").image.tobytes() == mrt.render(scene, **SMALL).image.tobytes()
+    namesake = tmp_path / "other" / "mine.xml"
     with pytest.raises(UsageError, match="2 jobs would write the same file scene=mine"):
-        mrt.sweep(None, out, grid={"scene": [str(scene), str(tmp_path / "other" / "mine.xml")]}, **options)
-    (row,) = mrt.sweep(scene, tmp_path / "late", cluster=mortal(CHANGES).address, **SMALL).failed
+        mrt.sweep(None, out, grid={"scene": [str(scene), str(namesake)]}, **options)
+    changing = mortal(CHANGES)
+    (row,) = mrt.sweep(scene, tmp_path / "late", cluster=changing.address, **SMALL).failed
     assert "mine.xml has changed since the sweep began" in row["error"]
 
 
-@pytest.mark.parametrize(
-    ("grid", "options", "message"),
-    [
-        ({"aaa": [1]}, {}, "'aaa' is not an option of render: did you mean aa"),
-        ({"aa": []}, {}, "aa is an empty list"),
-        ([1], {}, r'grid=\[1\]: give a dict of lists, such as {"aa": \[1, 2\]}'),
-        ({1: [1]}, {}, "'1' is not an option of render"),
-        ({"a\nb": [1]}, {}, r"'a\\nb' is not an option of render"),
-        ({"seed": itertools.count()}, {}, "more than 100000 jobs"),
-        ({"seed": range(1000), "aa": range(1, 65), "spp": [1, 2]}, {}, "more than 100000 jobs"),
-        ({"params": [3]}, {}, "params=3: must be a dict"),
-        ({}, {"out": "a\0b"}, "cannot make the folder"),
-        ({}, {"out": __file__ + "/out"}, "cannot make the folder"),
-        ({"aa": 3}, {}, r"aa is 3; give a list of values, such as \[3\]"),
-        ({"aamode": "luma"}, {}, "aamode is 'luma'; give a list"),
-        ({"aa": [0]}, {}, "aa=0: must be a whole number"),
-        ({"focaldist": [1.0, float("nan")]}, {}, "focaldist=nan: must be a finite number"),
-        ({"motion": [[0, 0, float("inf")]]}, {}, "must be three finite numbers"),
-        ({"aa": [1, 2, 1]}, {}, "2 jobs would write the same file aa=1"),
-        ({"aa": [1]}, {"aa": 2}, "aa is given twice"),
-        ({"material_0.alpa": [0.1]}, {}, "no parameter material_0.alpa: did you mean material_0.alpha?"),
-        ({"material_0.alpha": ["rough"]}, {}, "material_0.alpha='rough': must be a Float"),
-        ({"scene": [1]}, {"scene": 3}, "scene is given twice"),
-        ({"scene": [99]}, {"scene": None}, "99"),
-        ({"scene": ["none.xml"]}, {"scene": None}, "cannot read none.xml"),
-        ({"aa": [1, 2], "seed": [1]}, {"zipped": True}, "zipped axes must be of one length"),
-        ({"integrator": [lambda: 0]}, {}, "cannot be sent to others"),
-        ({}, {"scene": {"type": lambda: 0}}, "give the scene as a number, a dict or a path"),
-        ({}, {"progres": 1}, "'progres' is not an option of render: did you mean progress"),
-        ({}, {"width": 0}, "width=0: must be"),
-        ({}, {"tiles": (2, 2), "png": True}, "leave out png"),
-        *(({}, {"tiles": tiles, **SMALL}, "tiles=") for tiles in ((0, 1), (2,), 3, (2.0, 2), (49, 1))),
-        ({"target": [0.1]}, {"tiles": (2, 2)}, "tiles: target and aamode=noise"),
-        ({}, {"workers": 0}, "workers=0: must be a whole number"),
-        ({}, {"workers": 2, "cluster": "tcp://127.0.0.1:9"}, "give one of them"),
-        ({}, {"retries": -1}, "retries=-1"),
-        ({}, {"cluster": "tcp://127.0.0.1:9"}, "no scheduler with workers answers at tcp://127.0.0.1:9"),
-        ({}, {"cluster": "nonsense://x"}, "no scheduler with workers answers at nonsense://x"),
-    ],
-)
-def test_a_broken_grid_is_refused_before_anything_is_rendered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, grid: Any, options: dict, message: str
-) -> None:
+wrong = Cases()
+
+
+def wrong_grid(says: str, grid: Any, **options: Any) -> None:
+    """Add a grid that must be refused, and what the error says, as a regular expression."""
+    wrong(grid, options, says, name=says)
+
+
+def wrong_options(says: str, **options: Any) -> None:
+    wrong_grid(says, {}, **options)
+
+
+wrong_grid("'aaa' is not an option of render: did you mean aa", {"aaa": [1]})
+wrong_grid("aa is an empty list", {"aa": []})
+wrong_grid(r'grid=\[1\]: give a dict of lists, such as {"aa": \[1, 2\]}', [1])
+wrong_grid("'1' is not an option of render", {1: [1]})
+wrong_grid(r"'a\\nb' is not an option of render", {"a\nb": [1]})
+wrong_grid("more than 100000 jobs", {"seed": itertools.count()})
+wrong_grid("more than 100000 jobs", {"seed": range(1000), "aa": range(1, 65), "spp": [1, 2]})
+wrong_grid("params=3: must be a dict", {"params": [3]})
+wrong_grid(r"aa is 3; give a list of values, such as \[3\]", {"aa": 3})
+wrong_grid("aamode is 'luma'; give a list", {"aamode": "luma"})
+wrong_grid("aa=0: must be a whole number", {"aa": [0]})
+wrong_grid("focaldist=nan: must be a finite number", {"focaldist": [1.0, float("nan")]})
+wrong_grid("must be three finite numbers", {"motion": [[0, 0, float("inf")]]})
+wrong_grid("2 jobs would write the same file aa=1", {"aa": [1, 2, 1]})
+wrong_grid("aa is given twice", {"aa": [1]}, aa=2)
+mistyped = "no parameter material_0.alpa: did you mean material_0.alpha?"
+wrong_grid(mistyped, {"material_0.alpa": [0.1]})
+wrong_grid("material_0.alpha='rough': must be a Float", {"material_0.alpha": ["rough"]})
+wrong_grid("scene is given twice", {"scene": [1]}, scene=3)
+wrong_grid("99", {"scene": [99]}, scene=None)
+wrong_grid("cannot read none.xml", {"scene": ["none.xml"]}, scene=None)
+wrong_grid("zipped axes must be of one length", {"aa": [1, 2], "seed": [1]}, zipped=True)
+wrong_grid("cannot be sent to others", {"integrator": [lambda: 0]})
+wrong_grid("tiles: target and aamode=noise", {"target": [0.1]}, tiles=(2, 2))
+
+wrong_options("cannot make the folder", out="a\0b")
+wrong_options("cannot make the folder", out=__file__ + "/out")
+wrong_options("give the scene as a number, a dict or a path", scene={"type": lambda: 0})
+wrong_options("'progres' is not an option of render: did you mean progress", progres=1)
+wrong_options("width=0: must be", width=0)
+wrong_options("leave out png", tiles=(2, 2), png=True)
+for tiles in ((0, 1), (2,), 3, (2.0, 2), (49, 1)):
+    wrong_options("tiles=", tiles=tiles, **SMALL)
+wrong_options("workers=0: must be a whole number", workers=0)
+wrong_options("give one of them", workers=2, cluster=NOWHERE)
+wrong_options("retries=-1", retries=-1)
+wrong_options(f"no scheduler with workers answers at {NOWHERE}", cluster=NOWHERE)
+wrong_options("no scheduler with workers answers at nonsense://x", cluster="nonsense://x")
+
+
+@pytest.mark.parametrize(("grid", "options", "message"), wrong)
+def test_a_broken_grid_is_refused_before_anything_is_rendered(tmp_path, monkeypatch, grid, options, message):
     monkeypatch.setattr("mrt_mitsuba.sweeps.cluster.CONNECTING", 0.5)
     with pytest.raises(MrtError, match=message):
         mrt.sweep(**{"scene": 3, "out": tmp_path / "out", "grid": grid} | options)
@@ -366,16 +407,22 @@ class Slow(Progress):
         yield lambda steps: time.sleep(0.2)
 
 
-def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path: Path) -> None:
-    out, cluster = tmp_path / "out", mortal(SPOILED, "--memory-limit", "1200MB")
+def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path):
+    out = tmp_path / "out"
+    cluster = mortal(SPOILED, "--memory-limit", "1200MB")
     options = {"cluster": cluster.address, "retries": 1, "progress": Slow(), **SMALL}
     table = mrt.sweep(3, out, grid={"seed": range(20)}, **options)
     errors = {row["seed"]: row["error"] for row in table.failed}
-    assert errors.keys() == {1, 3, 4} and errors[1] == "RuntimeError: out of luck"
-    assert errors[3] == errors[4] and "every worker that rendered it died, perhaps for want of" in errors[3]
+    assert errors.keys() == {1, 3, 4}
+    assert errors[1] == "RuntimeError: out of luck"
+    assert errors[3] == errors[4]
+    assert "every worker that rendered it died, perhaps for want of" in errors[3]
     attempts = [row["attempts"] for row in table.rows]
-    assert attempts[1] == 2 <= attempts[2] and attempts[5] == 1
-    assert len(made(out)) == 17 and not left_over(out) and str(table).startswith("17 of 20 pictures")
+    assert attempts[1] == 2 <= attempts[2]
+    assert attempts[5] == 1
+    assert len(made(out)) == 17
+    assert not left_over(out)
+    assert str(table).startswith("17 of 20 pictures")
     assert all(row["file"] == "" for row in table.failed)
 
 
@@ -387,10 +434,11 @@ def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path: Pa
     ],
     ids=["another version", "none"],
 )
-def test_workers_with_other_software_are_refused(mortal, tmp_path: Path, preload: str, message: str) -> None:
+def test_workers_with_other_software_are_refused(mortal, tmp_path, preload, message):
     with pytest.raises(MrtError, match=f"(?s){message}.*install") as caught:
         mrt.sweep(3, tmp_path / "out", cluster=mortal(preload).address, **SMALL)
-    assert "\n" not in str(caught.value) and not made(tmp_path / "out")
+    assert "\n" not in str(caught.value)
+    assert not made(tmp_path / "out")
 
 
 # What each worker runs first: seed 1 costs the first worker that takes it, and from 2 on jobs wait
@@ -416,7 +464,7 @@ def waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(waiting, tmp_path: Path) -> None:
+def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(waiting, tmp_path):
     import psutil
 
     def children() -> list[psutil.Process]:
@@ -425,16 +473,16 @@ def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(waiting, tmp_p
     before = children()
     (tmp_path / "go").touch()
     table = mrt.sweep(3, tmp_path / "out", workers=1, grid={"seed": range(3)}, **SMALL)
-    assert [row["error"] for row in table.rows] == [""] * 3 and table.rows[1]["attempts"] == 2
+    assert [row["error"] for row in table.rows] == [""] * 3
+    assert table.rows[1]["attempts"] == 2
     assert set(children()) <= set(before)
 
 
 @pytest.mark.parametrize("back", [True, False][:ROUNDS])
-def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(
-    mortal, tmp_path: Path, back: bool
-) -> None:
+def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(mortal, tmp_path, back):
     """Also where one comes back at once under its address, without its workers."""
-    cluster, out = mortal(WAITING), tmp_path / "out"
+    cluster = mortal(WAITING)
+    out = tmp_path / "out"
     (cluster.folder / "died").touch()
     options: dict[str, Any] = {"grid": {"seed": range(6)}, **SMALL}
     with ThreadPool(1) as pool:
@@ -447,31 +495,39 @@ def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(
         with pytest.raises(MrtError, match="the scheduler is gone"):
             sweep.get(PATIENCE)
     first = made(out)
-    assert len(first) == 2 and {row["file"] for row in written(out)} <= first.keys()
+    assert len(first) == 2
+    assert {row["file"] for row in written(out)} <= first.keys()
     (cluster.folder / "go").touch()
     if back:
         cluster.start_workers()
-    table = mrt.sweep(3, out, cluster=cluster.address if back else mortal().address, **options)
-    assert len(table.rows) == 6 and not table.failed and not left_over(out)
+    running = cluster if back else mortal()
+    table = mrt.sweep(3, out, cluster=running.address, **options)
+    assert len(table.rows) == 6
+    assert not table.failed
+    assert not left_over(out)
     assert first.items() <= made(out).items()
 
 
 SWEEP = "scene = 3\nwidth = 64\nheight = 48\naa = 1\n[grid]\nseed = [0, 1, 2, 3, 4, 5]\n"
 
 
-def test_the_command_interrupted_from_the_keyboard_and_again(start, waiting, tmp_path: Path, capsys) -> None:
+def test_the_command_interrupted_from_the_keyboard_and_again(start, waiting, tmp_path, capsys):
     """The whole group of processes gets the signal, as from a terminal."""
     (tmp_path / "sweep.toml").write_text(SWEEP)
     (tmp_path / "died").touch()
-    words, out = ["sweep", "out", "sweep.toml"], tmp_path / "out"
+    words = ["sweep", "out", "sweep.toml"]
+    out = tmp_path / "out"
     command = [sys.executable, "-m", "mrt_mitsuba.command.main", *words, "workers=2"]
     with start(*command, start_new_session=True) as process:
         wait_for(lambda: (out / "table.csv").exists(), "a row of the table")
         os.killpg(process.pid, signal.SIGINT)
         _, errors = process.communicate(timeout=PATIENCE)  # also the workers have ended
-    assert process.returncode == 130 and errors == "mrt: interrupted\n"
+    assert process.returncode == 130
+    assert errors == "mrt: interrupted\n"
     done = made(out)
-    assert 0 < len(done) < 6 and {row["file"] for row in written(out)} <= done.keys() and not left_over(out)
+    assert 0 < len(done) < 6
+    assert {row["file"] for row in written(out)} <= done.keys()
+    assert not left_over(out)
     for name in done:
         assert read_exr(out / name).image.shape == (48, 64, 3)
     (tmp_path / "go").touch()
@@ -480,7 +536,7 @@ def test_the_command_interrupted_from_the_keyboard_and_again(start, waiting, tmp
     assert [row["error"] for row in written(out)] == [""] * 6
 
 
-def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_is_pinned_to_each_worker(tmp_path, monkeypatch):
     """Whether there are some or not: what the driver will go by is in each worker's environment."""
     from mrt_mitsuba.sweeps.cluster import connected  # which needs Dask
 
@@ -498,18 +554,36 @@ def test_a_gpu_is_pinned_to_each_worker(tmp_path: Path, monkeypatch: pytest.Monk
     ],
     ids=["filters", "random numbers"],
 )
-def test_tiles_make_the_same_picture(address: str, tmp_path: Path, options: dict[str, Any]) -> None:
+def test_tiles_make_the_same_picture(address, tmp_path, options):
     size = {"width": 231, "height": 173}
     mrt.render(3, **size, **options).save(tmp_path / "whole.exr")
     table = mrt.sweep(3, tmp_path / "out", tiles=(3, 4), cluster=address, **size, **options)
-    assert [row["error"] for row in table.rows] == [""] and table.rows[0]["rays"] > 231 * 173
+    assert [row["error"] for row in table.rows] == [""]
+    assert table.rows[0]["rays"] > 231 * 173
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["picture.exr", "table.csv"]
-    whole, tiled = (read_exr(path) for path in (tmp_path / "whole.exr", tmp_path / "out" / "picture.exr"))
+    whole = read_exr(tmp_path / "whole.exr")
+    tiled = read_exr(tmp_path / "out" / "picture.exr")
     assert tiled.image.tobytes() == whole.image.tobytes()
     for name, values in (tiled.layers | whole.layers).items():
         assert tiled.layers[name].tobytes() == whole.layers[name].tobytes() == values.tobytes(), name
-    both = [{key: str(x) for key, x in p.header.items() if key != "mrt:sweep"} for p in (whole, tiled)]
-    assert both[0] == both[1]
+    for header in (whole.header, tiled.header):
+        header.pop("mrt:sweep", None)
+    assert {key: str(x) for key, x in tiled.header.items()} == {
+        key: str(x) for key, x in whole.header.items()
+    }
+
+
+def test_tiles_keep_to_the_memory_that_was_granted(address, tmp_path):
+    size = {"width": 4096, "height": 4096, "aa": 1}
+    (row,) = mrt.sweep(3, tmp_path, tiles=(1, 2), cluster=address, memory="64M", **size).failed
+    assert "of memory, and 64 MiB may be" in row["error"]
+
+
+def test_the_command_says_that_a_job_failed(address, tmp_path, capsys):
+    lines = ["scene = 3", "width = 4096", "height = 4096", "aa = 1", 'memory = "64M"']
+    (tmp_path / "sweep.toml").write_text("\n".join(lines))
+    assert cli.main(["sweep", str(tmp_path / "out"), str(tmp_path / "sweep.toml"), f"cluster={address}"]) == 1
+    assert "failed: " in capsys.readouterr().out
 
 
 # What each worker runs first: it notes the tiles that it renders, and fails below the first row until allowed
@@ -527,9 +601,10 @@ if api.render.__module__ == api.__name__:  # it is read more than once
 """
 
 
-def test_tiles_of_an_earlier_sweep_are_kept(mortal, tmp_path: Path) -> None:
+def test_tiles_of_an_earlier_sweep_are_kept(mortal, tmp_path):
     """Those that are whole: of two that are there, one was cut in the meantime."""
-    address, out = mortal(BROKEN).address, tmp_path / "out"
+    address = mortal(BROKEN).address
+    out = tmp_path / "out"
     first = mrt.sweep(3, out, tiles=(2, 2), retries=0, cluster=address, **SMALL)
     assert "out of luck" in first.failed[0]["error"]
     tile, cut = (out / "picture.tiles" / f"0,{column}.exr" for column in (0, 1))
@@ -537,7 +612,8 @@ def test_tiles_of_an_earlier_sweep_are_kept(mortal, tmp_path: Path) -> None:
     cut.write_bytes(cut.read_bytes()[:9000])
     (tmp_path / "cluster0" / "allowed").touch()
     second = mrt.sweep(3, out, tiles=(2, 2), cluster=address, **SMALL)
-    assert not second.failed and second.rows[0]["rays"] is None  # unknown of the tile that was there
+    assert not second.failed
+    assert second.rows[0]["rays"] is None  # unknown of the tile that was there
     rendered = (tmp_path / "cluster0" / "rendered").read_text().splitlines()
     assert sorted(map(rendered.count, rendered)) == [1, 1, 1, 2, 2]
     assert read_exr(out / "picture.exr").image.tobytes() == mrt.render(3, **SMALL).image.tobytes()

@@ -33,7 +33,8 @@ def validate(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., t
     def run(*options: str, **studies: Callable[..., None]) -> tuple[int, Any, str]:
         for name, function in studies.items():
             module = types.ModuleType(f"mrt_mitsuba.validation.studies.{name}")
-            module.TITLE, module.run = TITLE, function  # type: ignore[attr-defined]
+            module.TITLE = TITLE
+            module.run = function  # type: ignore[attr-defined]
             monkeypatch.setitem(sys.modules, module.__name__, module)
         monkeypatch.setattr(cli, "STUDIES", {name: (name, "", 1, 2) for name in studies})
         code = cli.main(["all", "--out", str(tmp_path), *options])
@@ -68,7 +69,7 @@ def broken(study: Study, *, quick: bool) -> None:
     raise ZeroDivisionError("a light without <area>")
 
 
-def test_everything_a_study_finds_is_written(validate, tmp_path: Path, capsys) -> None:
+def test_everything_a_study_finds_is_written(validate, tmp_path, capsys):
     code, summary, page = validate("--quick", good=good)
     assert code == 0
     parts = ["answer.csv", "ball.png", "curve.png", "errors.csv"]
@@ -88,11 +89,14 @@ def test_everything_a_study_finds_is_written(validate, tmp_path: Path, capsys) -
     # goals are not reached, and yet the study has passed; one is within the interval
     assert [goal["verdict"] for goal in found["goals"]] == ["slower", "open"]
     shown = capsys.readouterr().out
-    assert "ok     largest error" in shown and "slower ratio of seconds" in shown
+    assert "ok     largest error" in shown
+    assert "slower ratio of seconds" in shown
     # The page holds all of it and loads nothing; answers come first, tables last, and texts are texts
     links = re.findall(r'(?:src|href)="(.*?)"', page)
     assert all(link.startswith(("#", "data:image/png;base64,")) for link in links)
-    assert len(re.findall("<img", page)) == 2 and "<script" not in page and "<b>" not in page
+    assert len(re.findall("<img", page)) == 2
+    assert "<script" not in page
+    assert "<b>" not in page
     assert page.index("What to do") < page.index("A curve") < page.index("Errors")
     texts = [TITLE, "in a <b>sentence</b>.", "0.1235", "2e-05", "12345678", "yes", "inf", "1e-06", "a reason"]
     texts += ["✓ holds", "slower", "not decided", "cores", "quick settings", "<em>The original</em>"]
@@ -109,51 +113,59 @@ def test_everything_a_study_finds_is_written(validate, tmp_path: Path, capsys) -
     ],
     ids=["missed", "unknown", "broken", "empty"],
 )
-def test_what_does_not_pass_is_shown_and_the_others_go_on(validate, capsys, bad, verdict: str) -> None:
+def test_what_does_not_pass_is_shown_and_the_others_go_on(validate, capsys, bad, verdict):
     code, summary, page = validate(bad=bad, good=good)
-    assert code == 1 and summary["passed"] is False
+    assert code == 1
+    assert summary["passed"] is False
     assert [study["verdict"] for study in summary["studies"].values()] == [verdict, "passed"]
     assert f"✗ {verdict}" in page
     if bad is broken:
-        assert "ZeroDivisionError: a light without <area>" in unescape(page) and "found before" in page
+        assert "ZeroDivisionError: a light without <area>" in unescape(page)
+        assert "found before" in page
         assert "FAILED ZeroDivisionError: a light without <area>" in capsys.readouterr().out
 
 
-def test_list_has_a_line_on_each_study_and_each_can_be_run(capsys, monkeypatch, tmp_path: Path) -> None:
+def test_list_has_a_line_on_each_study_and_each_can_be_run(capsys, monkeypatch, tmp_path):
     for option in ("--list", "--help"):
         with pytest.raises(SystemExit) as ended:
             cli.main([option])
         text = capsys.readouterr().out
-        assert ended.value.code == 0 and all(about and about in text for _, about, *_ in cli.STUDIES.values())
+        assert ended.value.code == 0
+        assert all(about and about in text for _, about, *_ in cli.STUDIES.values())
     for name, _, quick, full in cli.STUDIES.values():
         module = import_module(f"mrt_mitsuba.validation.studies.{name}")
-        assert module.TITLE and callable(module.run) and 0 < quick < full
+        assert module.TITLE
+        assert callable(module.run)
+        assert 0 < quick < full
     monkeypatch.setattr(cli, "STUDIES", {"gone": ("no_such_module", "", 1, 2)})
     assert cli.main(["gone", "--out", str(tmp_path / "new")]) == 1
     assert "ModuleNotFoundError" in (tmp_path / "new" / "summary.json").read_text()
 
 
 @pytest.mark.parametrize("arguments", [[], ["cones"], ["all", "--quik"], ["all", "--out"]])
-def test_wrong_usage(arguments: list[str], capsys) -> None:
+def test_wrong_usage(arguments, capsys):
     with pytest.raises(SystemExit) as ended:
         cli.main(arguments)
-    assert ended.value.code == 2 and "usage: mrt-validate" in capsys.readouterr().err
+    assert ended.value.code == 2
+    assert "usage: mrt-validate" in capsys.readouterr().err
 
 
-def test_what_is_missing_is_found_before_the_work(monkeypatch, tmp_path: Path, capsys) -> None:
+def test_what_is_missing_is_found_before_the_work(monkeypatch, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     (tmp_path / "index.html").mkdir()
     for folder in (tmp_path / "file", tmp_path):
         assert cli.main(["laws", "--out", str(folder)]) == 1
-        assert str(folder) in (errors := capsys.readouterr().err) and "laws:" not in errors
+        assert str(folder) in (errors := capsys.readouterr().err)
+        assert "laws:" not in errors
     monkeypatch.setattr(cli, "EXTRAS", (*cli.EXTRAS, "no_such_library"))
     assert cli.main(["laws", "--out", str(tmp_path / "report")]) == 1
     message = capsys.readouterr().err
     assert message.startswith("mrt-validate: no-such-library missing: ")
-    assert message.endswith(" -m pip install no-such-library\n") and not (tmp_path / "report").exists()
+    assert message.endswith(" -m pip install no-such-library\n")
+    assert not (tmp_path / "report").exists()
 
 
-def test_interrupt_leaves_the_report_as_it_was(validate, tmp_path: Path) -> None:
+def test_interrupt_leaves_the_report_as_it_was(validate, tmp_path):
     def interrupted(study: Study, *, quick: bool) -> None:
         raise KeyboardInterrupt
 
@@ -164,7 +176,7 @@ def test_interrupt_leaves_the_report_as_it_was(validate, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("wrong", [False, True])
-def test_long_lists_are_folded_unless_a_bound_is_missed(validate, wrong: bool) -> None:
+def test_long_lists_are_folded_unless_a_bound_is_missed(validate, wrong):
     def many(study: Study, *, quick: bool) -> None:
         study.table("long", "Long", ["i"], [[i] for i in range(40)])
         for i in range(40):

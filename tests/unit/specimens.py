@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -9,63 +12,71 @@ from mrt_mitsuba.plugins.microfacet import tan2_theta
 from mrt_mitsuba.plugins.variants import is_jit, updatable
 from mrt_mitsuba.validation.studies.power import changed_bsdf
 
-DIFFUSE, GLASS, MIRROR = {"type": "diffuse"}, {"type": "dielectric"}, {"type": "conductor"}
+DIFFUSE = {"type": "diffuse"}
+GLASS = {"type": "dielectric"}
+MIRROR = {"type": "conductor"}
 GLOSS = {"type": "roughconductor"}
 GLOSSY, DELTA = (+flag for flag in (mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DeltaReflection))
 
 
-def _value(change):
-    """A change of values and weights that knows where light comes from and goes to."""
-    return "value", lambda value, ctx, wi, wo: change(value, wi, wo)
+@dataclass(frozen=True)
+class Mistake:
+    """A change of a sound BSDF, as ``changed_bsdf`` takes it, and the figures that exceed their limits."""
+
+    kind: str
+    change: Any
+    figures: set[str]
+    nested: dict = field(default_factory=lambda: DIFFUSE)
 
 
-def _sample(change):
-    return "sample", lambda bs, weight, u, ctx: (bs, change(bs, weight, u, ctx))
+# --------------------- Changes of values and weights: of (value, ctx, wi, wo) ---------------------
 
 
-def _member(name, change):
-    """A change of samples: of one of their members."""
-
-    def apply(bs, weight, u, ctx):
-        setattr(bs, name, change(getattr(bs, name)))
-        return bs, weight
-
-    return "sample", apply
+def without_cosine(value, ctx, wi, wo):
+    return value / abs(wo.z)
 
 
-def _unscaled(bs, weight, u, ctx):
-    return weight * bs.eta**2 if ctx.mode == mi.TransportMode.Radiance else weight
+def no_number_at_grazing(value, ctx, wi, wo):
+    return dr.select(wo.z < 1e-3, dr.nan, value)
 
 
-def _turned(wo):
-    return mi.Vector3f(0.8 * wo.x - 0.6 * wo.y, 0.6 * wo.x + 0.8 * wo.y, wo.z)
+def no_number_in_sharp_lobes(value, ctx, wi, wo):
+    return dr.select(value > 1e5, dr.nan, value)
 
 
-def _brighter(value, wi, wo):
-    return 1.8 * value * (1 + 0.56 * (1 - abs(wi.z)) ** 8) * (1 + 0.56 * (1 - abs(wo.z)) ** 8)
+def brighter_near_the_horizon(value, ctx, wi, wo):
+    at_wi = 1 + 0.56 * (1 - abs(wi.z)) ** 8
+    at_wo = 1 + 0.56 * (1 - abs(wo.z)) ** 8
+    return 1.8 * value * at_wi * at_wo
 
 
-def _stairs(value, wi, wo):
+def in_stairs(value, ctx, wi, wo):
     if not is_jit():
         return value
     step = dr.exp(dr.round(dr.log(value) * 1e5) * 1e-5)
     return value * dr.detach(dr.select(value > 0, step / value, 0))
 
 
-def _steep(value, wi, wo):
-    return value + dr.sqrt(dr.maximum(0, dr.select(wo.x > 0.7, value - dr.detach(value), 0)))
+def steep(value, ctx, wi, wo):
+    attached = dr.select(wo.x > 0.7, value - dr.detach(value), 0)
+    return value + dr.sqrt(dr.maximum(0, attached))
 
 
-def _across(value, ctx, wi, wo):
+def across(value, ctx, wi, wo):
     """Light or density where light would go through the surface."""
     return value + dr.select(wi.z * wo.z < 0, 0.1 * abs(wo.z), 0)
 
 
-def _cancelling(value, wi, wo):
+def cancelling(value, ctx, wi, wo):
     """The slope of the half vector from a cosine near 1, as in the report."""
     h = wi + wo
-    lost = dr.exp(100 * (tan2_theta(h) + 1 - 1 / dr.square(dr.normalize(h).z)))
+    cosine = dr.normalize(h).z
+    lost = dr.exp(100 * (tan2_theta(h) + 1 - 1 / dr.square(cosine)))
     return dr.select(value > 0, value * lost, 0)
+
+
+def detached(value, ctx, wi, wo):
+    return dr.detach(value)
 
 
 SWITCHES = [0]  # of variants, so far
@@ -75,53 +86,130 @@ def _switched(*variants):
     SWITCHES[0] += 1
 
 
-# Sound BSDFs whose answers are changed: the BSDF, what is changed and how, and the figures that this exceeds
-CHANGES = {
+def by_switches(value, ctx, wi, wo):
+    return value * (1 + 1e-3 * (SWITCHES[0] % 4))
+
+
+# --------------------- Changes of samples: of (bs, weight, u, ctx) ---------------------
+
+
+def half_without_weight(bs, weight, u, ctx):
+    return bs, dr.select(bs.wo.x > 0, 0, weight)
+
+
+def unscaled(bs, weight, u, ctx):
+    radiance = ctx.mode == mi.TransportMode.Radiance
+    return bs, weight * bs.eta**2 if radiance else weight
+
+
+def with_the_densitys_derivative(bs, weight, u, ctx):
+    return bs, weight * dr.select(bs.pdf > 0, bs.pdf / dr.detach(bs.pdf), 1)
+
+
+def member(name, change):
+    """A change of a member of samples."""
+
+    def apply(bs, weight, u, ctx):
+        setattr(bs, name, change(getattr(bs, name)))
+        return bs, weight
+
+    return apply
+
+
+def inverted(eta):
+    return 1 / eta
+
+
+def nothing(eta):
+    return 0 * eta
+
+
+def too_long(wo):
+    return 1.01 * wo
+
+
+def turned(wo):
+    return mi.Vector3f(0.8 * wo.x - 0.6 * wo.y, 0.6 * wo.x + 0.8 * wo.y, wo.z)
+
+
+def to_the_other_side(wo):
+    return wo * mi.Vector3f(1, 1, -1)
+
+
+def called_glossy(kind):
+    return kind - DELTA + GLOSSY
+
+
+def following(component):
+    return component + 1
+
+
+SINGLE = {"reciprocity.single", "reciprocity.single_modes"}
+OF_VALUES = {
     # then it is no reciprocal value, and what sample() and eval() disagree on shows in the energy as well
-    "missing cosine": (DIFFUSE, "eval", lambda value, ctx, wi, wo: value / abs(wo.z),
-                       {"weights.weight", "energy.apart", "reciprocity.swapped"}),
-    "weights missing": (DIFFUSE, *_sample(lambda bs, weight, u, ctx: dr.select(bs.wo.x > 0, 0, weight)),
-                        {"weights.weight", "energy.apart"}),
-    "NaN at grazing": (DIFFUSE, *_value(lambda value, wi, wo: dr.select(wo.z < 1e-3, dr.nan, value)),
-                       {"finite.values"}),
-    "no eta^2 in single directions": (GLASS, *_sample(_unscaled),
-                                      {"reciprocity.single", "reciprocity.single_modes"}),
-    "eta inverted": (GLASS, *_member("eta", lambda eta: 1 / eta),
-                     {"reciprocity.single", "reciprocity.single_modes"}),
-    "eta of 0": (GLOSS, *_member("eta", lambda eta: 0 * eta), {"reciprocity.medium"}),
-    "directions not of length 1": (MIRROR, *_member("wo", lambda wo: 1.01 * wo), {"finite.samples"}),
-    "mirror turned": (MIRROR, *_member("wo", _turned), {"reciprocity.returns"}),
-    "mirror to the other side": (MIRROR, *_member("wo", lambda wo: wo * mi.Vector3f(1, 1, -1)),
-                                 {"reciprocity.single", "components.samples"}),
-    "mirror called glossy": (MIRROR, *_member("sampled_type", lambda kind: kind - DELTA + GLOSSY),
-                             {"weights.density", "weights.weight", "energy.apart", "components.samples"}),
-    "next component": (DIFFUSE, *_member("sampled_component", lambda i: i + 1), {"components.samples"}),
-    "albedo 1.02 near the horizon": (DIFFUSE, *_value(_brighter), {"energy.largest"}),
-    "stairs": (GLOSS, *_value(_stairs), {"roundoff.lost"}),
-    "cancelling half vector": (GLOSS, *_value(_cancelling), {"roundoff.lost"}),
-    "NaN at the least roughness": (
-        GLOSS, *_value(lambda value, wi, wo: dr.select(value > 1e5, dr.nan, value)), {"finite.values"}),
-    "updates ignored": (GLOSS, "stale", None, {"gradients.reached"}),
-    "detached gradient": (GLOSS, *_value(lambda value, wi, wo: dr.detach(value)), {"gradients.values"}),
+    "missing cosine": Mistake(
+        "eval", without_cosine, {"weights.weight", "energy.apart", "reciprocity.swapped"}
+    ),
+    "NaN at grazing": Mistake("value", no_number_at_grazing, {"finite.values", "finite.million"}),
+    "albedo 1.02 near the horizon": Mistake("value", brighter_near_the_horizon, {"energy.largest"}),
+    "stairs": Mistake("value", in_stairs, {"roundoff.lost"}, GLOSS),
+    "cancelling half vector": Mistake("value", cancelling, {"roundoff.lost"}, GLOSS),
+    "NaN at the least roughness": Mistake("value", no_number_in_sharp_lobes, {"finite.values"}, GLOSS),
+    "detached gradient": Mistake("value", detached, {"gradients.values"}, GLOSS),
+    "derivatives that are NaN": Mistake("value", steep, {"gradients.values", "gradients.broken"}, GLOSS),
+    # whatever types of lobes are asked for
+    "density through the surface": Mistake(
+        "pdf", across, {"sampling.cells", "sampling.integral", "components.masked_samples"}
+    ),
+    "light through the surface": Mistake(
+        "eval", across, {"components.values", "components.masked", "sampling.dark"}
+    ),
+    "another value after each switch": Mistake("value", by_switches, {"switch.same"}),
+}
+OF_SAMPLES = {
+    "weights missing": Mistake("sample", half_without_weight, {"weights.weight", "energy.apart"}),
+    "no eta^2 in single directions": Mistake("sample", unscaled, SINGLE, GLASS),
+    "eta inverted": Mistake("sample", member("eta", inverted), SINGLE, GLASS),
+    "eta of 0": Mistake("sample", member("eta", nothing), {"reciprocity.medium"}, GLOSS),
+    "directions not of length 1": Mistake("sample", member("wo", too_long), {"finite.samples"}, MIRROR),
+    "mirror turned": Mistake("sample", member("wo", turned), {"reciprocity.returns"}, MIRROR),
+    "mirror to the other side": Mistake(
+        "sample",
+        member("wo", to_the_other_side),
+        {"reciprocity.single", "components.samples"},
+        MIRROR,
+    ),
+    "mirror called glossy": Mistake(
+        "sample",
+        member("sampled_type", called_glossy),
+        {
+            "weights.density",
+            "weights.weight",
+            "energy.apart",
+            "components.samples",
+            "components.masked_samples",
+        },
+        MIRROR,
+    ),
+    "next component": Mistake("sample", member("sampled_component", following), {"components.samples"}),
     # of directions that move with the roughness
-    "derivative of the density in weights": (
-        GLOSS,
-        *_sample(lambda bs, weight, u, ctx: weight * dr.select(bs.pdf > 0, bs.pdf / dr.detach(bs.pdf), 1)),
-        {"gradients.mean"}),
-    "derivatives that are NaN": (GLOSS, *_value(_steep), {"gradients.values", "gradients.broken"}),
-    "black back": (DIFFUSE, "flags", +mi.BSDFFlags.BackSide, {"components.dark"}),
-    "a flag of no component": (DIFFUSE, "whole", +mi.BSDFFlags.Null, {"components.flags"}),
-    "a component more with each update": (DIFFUSE, "update", None, {"components.updated"}),
-    "active ignored": (DIFFUSE, "active", None, {"eval_pdf.inactive"}),
-    "density through the surface": (DIFFUSE, "pdf", _across, {"sampling.cells", "sampling.integral"}),
-    "light through the surface": (DIFFUSE, "eval", _across, {"components.values"}),
-    "another value after each switch": (
-        DIFFUSE, *_value(lambda value, wi, wo: value * (1 + 1e-3 * (SWITCHES[0] % 4))), {"switch.same"}),
-}  # fmt: skip
+    "derivative of the density in weights": Mistake(
+        "sample", with_the_densitys_derivative, {"gradients.mean"}, GLOSS
+    ),
+}
+OF_THE_REST = {
+    "updates ignored": Mistake("stale", None, {"gradients.reached"}, GLOSS),
+    "black back": Mistake("flags", +mi.BSDFFlags.BackSide, {"components.dark"}),
+    "a flag of no component": Mistake("whole", +mi.BSDFFlags.Null, {"components.flags"}),
+    "a component more with each update": Mistake("update", None, {"components.updated"}),
+    "active ignored": Mistake("active", None, {"eval_pdf.inactive"}),
+}
+MISTAKES = OF_VALUES | OF_SAMPLES | OF_THE_REST
+CHANGES = {name: (mistake.nested, mistake.kind, mistake.change) for name, mistake in MISTAKES.items()}
 
 
 def exceeded(check):
-    """Return the figures of laws that are beyond their limits."""
+    """The figures of laws that are beyond their limits."""
     return {
         f"{law.name}.{part.figure}" for law in check.laws.values() for part in law.parts if not part.holds
     }
@@ -136,7 +224,8 @@ def register() -> None:
 
         def __init__(self, props):
             alpha = props.get("alpha", 0.2)
-            props["nested"], props["change"] = mi.load_dict({**GLOSS, "alpha": alpha}), ""
+            props["nested"] = mi.load_dict({**GLOSS, "alpha": alpha})
+            props["change"] = ""
             self.alpha = updatable(alpha)
             changed.__init__(self, props)
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from nodes import group
+from numpy.testing import assert_array_equal
 
 from mrt_mitsuba.plugins.point_buffer import PointBuffer
 from mrt_mitsuba.plugins.quadrics import Quadrics
@@ -24,7 +25,8 @@ PLACES = [(0.1, 0.2, 0.3), (0, 0, 0), (1.02, 1.02, 1.02), (5, 0, 0), (-40, 3, 2)
 def crowd(size: float, shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Ends and radii of objects, and points within and without."""
     rng = np.random.default_rng(3)
-    starts, radii = rng.uniform(-1, 1, (300, 3)), size * rng.uniform(0.02, 0.12, 300)
+    starts = rng.uniform(-1, 1, (300, 3))
+    radii = size * rng.uniform(0.02, 0.12, 300)
     ends = starts + rng.normal(scale=0.1, size=(300, 3))
     points = rng.uniform(-1.2, 1.2, (20_000, 3)) * rng.choice([1, 3], (20_000, 1))
     starts, ends, points = (size * (p + shift) for p in (starts, ends, points))
@@ -33,7 +35,7 @@ def crowd(size: float, shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 @pytest.mark.parametrize(("size", "shift"), [(1, 0), (1e6, 0), (1e-6, 0), (1, 300)])
 @pytest.mark.parametrize("kind", ["sphere", "cone", "cylinder"])
-def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: float) -> None:
+def test_light_buffers_find_what_a_search_finds(kind, size, shift):
     """Spheres: to the bit what Embree finds; quadrics: what the tree does. Lights are inside and far off.
 
     The last is within an object, near its surface.
@@ -59,17 +61,18 @@ def test_light_buffers_find_what_a_search_finds(kind: str, size: float, shift: f
         found = np.array(buffer.any(mi.UInt32(number), ray.d, mi.Bool(True), test))
         expected = np.array(search(ray))
         assert 0.02 < expected.mean() <= (0.98 if number < len(PLACES) else 1)
-        np.testing.assert_array_equal(found, expected)
+        assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("size", [1, 1e6])
 @pytest.mark.parametrize("kind", ["cone", "cylinder"])
-def test_lists_around_the_eye_find_what_a_search_finds(kind: str, size: float) -> None:
+def test_lists_around_the_eye_find_what_a_search_finds(kind, size):
     """For rays from there, wherever they start; those from elsewhere are searched for."""
     starts, ends, radii, aims = crowd(size, 0)
     things = Quadrics([mi.load_dict(group(np.column_stack([starts, ends, radii]), kind=kind))])
     for place in size * np.array(PLACES[1:4]):
-        eye, lists = dr.opaque(mi.Point3f, place.tolist()), PointBuffer(place[None], *things.boxes())
+        eye = dr.opaque(mi.Point3f, place.tolist())
+        lists = PointBuffer(place[None], *things.boxes())
         d = dr.normalize(mi.Point3f(aims.T) - eye)
         for way, at_eye in ((d, 1), (-d, 0), (dr.cross(d, mi.Vector3f(1, 0, 0)), 0)):
             start = eye + dr.opaque(mi.Float, 0.3 * size) * way
@@ -77,7 +80,7 @@ def test_lists_around_the_eye_find_what_a_search_finds(kind: str, size: float) -
             dr.eval(ray)
             found, expected = (things.intersect(ray, mi.Bool(True), where) for where in (lists, None))
             assert np.mean(np.array(expected[0]) < 1e38) > 0.02
-            np.testing.assert_array_equal(found, expected)
+            assert_array_equal(found, expected)
             listed, seen = lists.nearest(ray, mi.Bool(True), lambda *_: (mi.Float(0),), (ray.maxt,))
             assert np.mean(seen) == at_eye
             assert np.mean(np.array(listed[0]) == 0) >= 0.02 * at_eye  # where something is listed

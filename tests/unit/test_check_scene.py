@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -12,9 +13,11 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
+from mrt_mitsuba.validation.checks import emitter as emitters
 from mrt_mitsuba.validation.checks import scene as checks
 from mrt_mitsuba.validation.checks.law import Check
-from mrt_mitsuba.validation.studies.power import changed_bsdf, put
+from mrt_mitsuba.validation.studies import power
+from mrt_mitsuba.validation.studies.power import changed_bsdf, changed_sky, put
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -32,10 +35,10 @@ SCENE = """<scene version="3.0.0">
 </scene>"""
 
 
-def poisoned() -> None:
+def poisoned():
     """Register a diffuse BSDF that is no number where it is seen at less than 6 degrees from the normal."""
 
-    def poison(value: Any, ctx: Any, wi: Any, wo: Any) -> Any:
+    def poison(value, ctx, wi, wo):
         return dr.select((wi.z > 0.995) & (value != 0), dr.nan, value)
 
     changes = {"poison": ({"type": "diffuse"}, "eval", poison)}
@@ -43,12 +46,12 @@ def poisoned() -> None:
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Any:
+def scene(tmp_path):
     """Writes the scene with a BSDF on its ball."""
     poison = '<string name="change" value="poison"/><bsdf type="diffuse" name="nested"/>'
     inside = {"diffuse": "", "poisoned": poison}
 
-    def write(bsdf: str) -> str:
+    def write(bsdf):
         path = tmp_path / "scene.xml"
         path.write_text(SCENE.format(bsdf=f'<bsdf type="{bsdf}" id="paint">{inside[bsdf]}</bsdf>'))
         return str(path)
@@ -56,7 +59,7 @@ def scene(tmp_path: Path) -> Any:
     return write
 
 
-def test_a_sound_scene(scene, capsys, tmp_path: Path) -> None:
+def test_a_sound_scene(scene, capsys, tmp_path):
     assert cli.main(["check", f"scene={scene('diffuse')}", "quick=1", f"out={tmp_path / 'out'}"]) == 0
     printed = capsys.readouterr().out
     for name in ("BSDF SmoothDiffuse paint", "shape Sphere ball", "emitter ConstantBackgroundEmitter sky"):
@@ -65,7 +68,7 @@ def test_a_sound_scene(scene, capsys, tmp_path: Path) -> None:
     assert "SmoothDiffuse paint" in (tmp_path / "out" / "index.html").read_text()
 
 
-def test_the_pixel_and_its_object_are_found(scene, capsys) -> None:
+def test_the_pixel_and_its_object_are_found(scene, capsys):
     poisoned()
     path = scene("poisoned")
     found = mrt.check_scene(path, quick=True)
@@ -79,7 +82,7 @@ def test_the_pixel_and_its_object_are_found(scene, capsys) -> None:
     assert "Made by the BSDF" in found._repr_html_()
 
 
-def test_a_light_that_is_no_number_and_instances() -> None:
+def test_a_light_that_is_no_number_and_instances():
     group = {"type": "shapegroup", "a": {"type": "sphere"}}
     place = mi.ScalarTransform4f().translate([0, 0, -3])
     nodes = {
@@ -113,13 +116,13 @@ STOCK: dict[str, dict[str, Any]] = {
 
 
 @pytest.fixture
-def lights_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def lights_only(monkeypatch):
     """The square below the light has been checked elsewhere."""
     for name in ("check_bsdf", "check_shape"):
         monkeypatch.setattr(checks, name, lambda *_, **__: Check("", "", {}, 0.0))
 
 
-def failed(light: dict[str, Any]) -> set[str]:
+def failed(light):
     """Return the laws that a light fails over a square, as part of a scene."""
     view = mi.ScalarTransform4f().look_at([0, -4, 2], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 8, "height": 6}
@@ -135,66 +138,133 @@ def failed(light: dict[str, Any]) -> set[str]:
     [*((name, "llvm_ad_rgb") for name in STOCK), ("envmap", "scalar_rgb"), ("envmap", "llvm_ad_spectral")],
     indirect=["variant"],
 )
-def test_stock_emitters_and_ours(name: str, variant: str) -> None:
+def test_stock_emitters_and_ours(name, variant):
     given = {k: mi.Bitmap(v) if k == "bitmap" else v for k, v in STOCK[name].items()}
     assert not failed({"type": name, **given})
 
 
-def upwards(d: Any) -> Any:
-    return mi.Vector3f(d.x, d.y, abs(d.z))
+def larger(value, *_):
+    return 1.01 * value
 
 
-# Changes of a sky: of the "direction" and "weight" of its samples, and of other answers; the laws they break
-MISTAKES: dict[str, tuple[dict[str, Any], set[str]]] = {
-    "none": ({}, set()),
-    "density x 1.01": ({"direction": lambda ds, u: put(ds, pdf=1.01 * ds.pdf)}, {"density", "weights"}),
-    "pdf_direction x 1.1": ({"pdf": lambda pdf: 1.1 * pdf}, {"density", "sampling"}),
-    "weight x 1.01": ({"weight": lambda weight, u: 1.01 * weight}, {"weights"}),
-    "seen 0.99 times as bright": ({"seen": lambda light: 0.99 * light}, {"weights"}),
-    "eval_direction x 0.99": ({"value": lambda light: 0.99 * light}, {"weights"}),
-    "half of the sky": (
-        {"direction": lambda ds, u: put(ds, p=ds.p + ds.dist * (upwards(ds.d) - ds.d), d=upwards(ds.d))},
-        {"sampling"},
-    ),
-    "wrong distance": ({"direction": lambda ds, u: put(ds, dist=0.995 * ds.dist)}, {"sampling"}),
-    "direction too long": ({"direction": lambda ds, u: put(ds, d=1.0005 * ds.d)}, {"sampling", "finite"}),
-    "NaN": ({"weight": lambda weight, u: dr.select(u.x > 0.99, dr.nan, weight)}, {"finite"}),
-    "negative": ({"weight": lambda weight, u: -weight}, {"finite", "weights"}),
-}  # fmt: skip
+def darker(light):
+    return 0.99 * light
+
+
+def denser(pdf, ds):
+    return 1.1 * pdf
+
+
+def stated_denser(ds, u):
+    return put(ds, pdf=1.01 * ds.pdf)
+
+
+def upwards(ds, u):
+    d = mi.Vector3f(ds.d.x, ds.d.y, abs(ds.d.z))
+    return put(ds, p=ds.p + ds.dist * (d - ds.d), d=d)
+
+
+def nearer(ds, u):
+    return put(ds, dist=0.995 * ds.dist)
+
+
+def too_long(ds, u):
+    return put(ds, d=1.0005 * ds.d)
+
+
+def no_number(weight, u):
+    return dr.select(u.x > 0.99, dr.nan, weight)
+
+
+def negative(weight, u):
+    return -weight
+
+
+@dataclass
+class Mistake:
+    """A change of a sky, as ``changed_sky`` takes it, and the laws that it breaks."""
+
+    kind: str
+    change: Callable
+    laws: set[str]
+
+
+MISTAKES = {
+    "none": Mistake("", larger, set()),
+    "density x 1.01": Mistake("direction", stated_denser, {"density", "weights"}),
+    "pdf_direction x 1.1": Mistake("pdf", denser, {"density", "sampling"}),
+    "weight x 1.01": Mistake("weight", larger, {"weights"}),
+    "seen 0.99 times as bright": Mistake("seen", darker, {"weights"}),
+    "eval_direction x 0.99": Mistake("value", darker, {"weights"}),
+    "half of the sky": Mistake("direction", upwards, {"sampling"}),
+    "wrong distance": Mistake("direction", nearer, {"sampling"}),
+    "direction too long": Mistake("direction", too_long, {"sampling", "finite"}),
+    "NaN": Mistake("weight", no_number, {"finite"}),
+    "negative": Mistake("weight", negative, {"finite", "weights"}),
+}
 
 
 @pytest.mark.usefixtures("lights_only")
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_each_mistake_fails_its_own_laws(mistake: str) -> None:
-    changes, laws = MISTAKES[mistake]
-
-    def changed(kind: str, value: Any, *more: Any) -> Any:
-        return changes[kind](value, *more) if kind in changes else value
-
-    class Sky(mi.Emitter):
-        def __init__(self, props: Any) -> None:
-            mi.Emitter.__init__(self, props)
-            self.m_flags, self.sound = mi.EmitterFlags.Infinite, mi.load_dict({"type": "constant"})
-
-        def eval(self, si: Any, active: Any = True) -> Any:
-            return changed("seen", self.sound.eval(si, active))
-
-        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> Any:
-            ds, weight = self.sound.sample_direction(it, sample, active)
-            ds.emitter = mi.EmitterPtr(self)
-            return changed("direction", ds, sample), changed("weight", weight, sample)
-
-        def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
-            return changed("pdf", self.sound.pdf_direction(it, ds, active))
-
-        def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
-            return changed("value", self.sound.eval_direction(it, ds, active))
-
-        def bbox(self) -> Any:
-            return mi.ScalarBoundingBox3f()
-
-        def to_string(self) -> str:
-            return "Sky"
-
-    mi.register_emitter("sky", Sky)
+def test_each_mistake_fails_its_own_laws(mistake):
+    laws = MISTAKES[mistake].laws
+    mi.register_emitter("sky", changed_sky({MISTAKES[mistake].kind: MISTAKES[mistake].change}))
     assert failed({"type": "sky"}) == laws
+    assert set(mrt.check_emitter({"type": "sky"}, quick=True).failed) == laws
+    loaded = mi.load_dict({"type": "sky"})
+    assert set(mrt.check_emitter(loaded, quick=True, seed=1).failed) == laws
+
+
+EMITTERS: dict[str, dict[str, Any]] = {
+    **STOCK,
+    "area": {},
+    "projector": {"irradiance": {"type": "bitmap", "bitmap": SUN, "raw": True}},
+}
+
+
+@pytest.mark.parametrize("name", EMITTERS)
+def test_emitters_by_themselves(name, tmp_path):
+    parameters = dict(EMITTERS[name])
+    if name == "envmap":
+        parameters["bitmap"] = mi.Bitmap(SUN)
+    if name == "projector":
+        parameters["irradiance"] = {"type": "bitmap", "bitmap": mi.Bitmap(SUN), "raw": True}
+    check = mrt.check_emitter({"type": name, **parameters}, quick=True)
+    known = ["finite"] if name == "projector" else []  # its eval_direction() is negative behind it
+    assert check.failed == known, str(check)
+    assert list(check.laws) == list(emitters.LAWS)
+    assert not check.laws["weights"].skipped  # some of the points are lit
+    check.save(tmp_path)
+    assert name in (tmp_path / "index.html").read_text()
+
+
+def test_an_emitter_of_a_loaded_scene():
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "light": {"type": "area"}}})
+    (emitter,) = scene.emitters()
+    assert mrt.check_emitter(emitter, scene=scene, quick=True).passed
+    with pytest.raises(mrt.UsageError, match="give the scene that it belongs to"):
+        mrt.check_emitter(emitter, quick=True)
+
+
+def test_a_shape_with_an_emitter():
+    lamp = {"type": "sphere", "light": {"type": "area", "radiance": {"type": "rgb", "value": [1, 2, 3]}}}
+    assert mrt.check_emitter(lamp, quick=True).passed
+    assert mrt.check_emitter(lamp, only=["weights"]).laws.keys() == {"weights"}
+
+
+@pytest.mark.parametrize("given", [{"type": "sphere"}, {"type": "diffuse"}, 3])
+def test_what_is_no_emitter(given):
+    with pytest.raises(mrt.UsageError, match="is not an emitter"):
+        mrt.check_emitter(given)
+
+
+def test_each_figure_of_an_emitter_has_a_specimen():
+    known = {fault.figure for fault in power.FAULTS if fault.kind == "emitter"}
+    known |= {
+        "sampling.place",
+        "sampling.counts",
+        "sampling.slices",
+        "weights.seen",
+        "finite.bad",
+    }  # of ``MISTAKES``
+    assert known == {f"{n}.{figure}" for n, law in emitters.LAWS.items() for figure in vars(law)["figures"]}

@@ -12,11 +12,9 @@ import sys
 import time
 import types
 import warnings
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
+from cases import Cases
 
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.command import options, registry
@@ -29,16 +27,21 @@ from mrt_mitsuba.validation.tools.compare import Difference
 SMALL = ("width=16", "height=12")
 
 
-def test_render_writes_and_says_what_the_report_says(tmp_path: Path, capsys) -> None:
+def test_render_writes_and_says_what_the_report_says(tmp_path, capsys):
     before = warnings.showwarning, signal.getsignal(signal.SIGTERM)
     out = str(tmp_path / "out")
     assert cli.main([out, "3", *SMALL, "aa=2", "aamode=luma"]) == 0
     text, errors = capsys.readouterr()
     *lines, wrote, last = text.splitlines()
     values = {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
-    assert values["Width"] == "16" and values["Height"] == "12" and values["AA"] == "2"
-    assert values["AA mode"] == "luma" and values["F distance"] == values["F range"] == "2.0"
-    assert "Computing Anti aliasing.." in lines and "kernel" not in text and errors == ""
+    assert values["Width"] == "16"
+    assert values["Height"] == "12"
+    assert values["AA"] == "2"
+    assert values["AA mode"] == "luma"
+    assert values["F distance"] == values["F range"] == "2.0"
+    assert "Computing Anti aliasing.." in lines
+    assert "kernel" not in text
+    assert errors == ""
     assert wrote == f"Wrote {out}.png and {out}.exr"
     float(last.removeprefix("Render time: ").removesuffix("s"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.exr", "out.png"]
@@ -56,40 +59,39 @@ def test_render_writes_and_says_what_the_report_says(tmp_path: Path, capsys) -> 
         ("scene=a.obj", "AA mode:    sobel"),
     ],
 )
-def test_banner_names_what_is_in_force(words: str, line: str) -> None:
+def test_banner_names_what_is_in_force(words, line):
     assert line in banner(options.parse(["out", *words.split()])).splitlines()
 
 
-def test_quiet_prints_nothing(tmp_path: Path, capsys) -> None:
+def test_quiet_prints_nothing(tmp_path, capsys):
     assert cli.main([str(tmp_path / "out"), *SMALL, "quiet=1", "plan=show", "format=png"]) == 0
     assert capsys.readouterr() == ("", "")
     assert [path.name for path in tmp_path.iterdir()] == ["out.png"]
 
 
-def test_listings(capsys) -> None:
+def test_listings(capsys):
     for words in (["help"], ["--help"], ["-h"]):
         assert cli.main(words) == 0
         text, errors = capsys.readouterr()
-        assert text.startswith("usage: mrt FILENAME [SCENE] [name=value ...]") and errors == ""
-    assert cli.main([]) == 2 and capsys.readouterr() == ("", text)
+        assert text.startswith("usage: mrt FILENAME [SCENE] [name=value ...]")
+        assert errors == ""
+    assert cli.main([]) == 2
+    assert capsys.readouterr() == ("", text)
     assert cli.main(["scenes"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list("0123456789")
 
 
-@pytest.mark.parametrize(
-    ("error", "quiet", "code", "text"),
-    [
-        (SceneError("no such file: a.xml"), 0, 1, "no such file: a.xml\n"),
-        (KeyboardInterrupt(), 0, 130, "interrupted\n"),
-        (MemoryError(), 0, 1, "out of memory: choose a smaller width, height or aa\n"),
-        (RuntimeError("a\nb"), 0, 1, "RuntimeError: a b (set MRT_TRACEBACK=1 to see where)\n"),
-        (MrtWarning("slow\nhere"), 0, 1, "warning: slow\\nhere\n"),
-        (MrtWarning("slow\nhere"), 1, 1, ""),
-    ],
-)
-def test_failures_and_warnings_are_one_line(
-    tmp_path: Path, monkeypatch, capsys, error: BaseException, quiet: int, code: int, text: str
-) -> None:
+failures = Cases()
+failures(SceneError("no such file: a.xml"), 0, 1, "no such file: a.xml\n")
+failures(KeyboardInterrupt(), 0, 130, "interrupted\n")
+failures(MemoryError(), 0, 1, "out of memory: choose a smaller width, height or aa\n")
+failures(RuntimeError("a\nb"), 0, 1, "RuntimeError: a b (set MRT_TRACEBACK=1 to see where)\n")
+failures(MrtWarning("slow\nhere"), 0, 1, "warning: slow\\nhere\n")
+failures(MrtWarning("slow\nhere"), 1, 1, "")
+
+
+@pytest.mark.parametrize(("error", "quiet", "code", "text"), failures)
+def test_failures_and_warnings_are_one_line(tmp_path, monkeypatch, capsys, error, quiet, code, text):
     def render(scene: object, **arguments: object) -> None:
         if isinstance(error, MrtWarning):
             warnings.warn(error, stacklevel=2)
@@ -102,14 +104,15 @@ def test_failures_and_warnings_are_one_line(
         warnings.simplefilter("default")
         assert cli.main(words) == code
     lines = capsys.readouterr().err.replace("mrt: after the warning\n", "")
-    assert lines == (f"mrt: {text}" if text else "") and list(tmp_path.iterdir()) == []
+    assert lines == (f"mrt: {text}" if text else "")
+    assert list(tmp_path.iterdir()) == []
     if "MRT_TRACEBACK" in text:
         monkeypatch.setenv(cli.TRACEBACK, "1")
         with pytest.raises(RuntimeError):
             cli.main(words)
 
 
-def test_what_is_not_installed_is_named_with_the_way_to_install_it(run_python: Callable[..., Any]) -> None:
+def test_what_is_not_installed_is_named_with_the_way_to_install_it(run_python):
     """By the command and from Python, where the tools of validation are missing."""
     text = "scipy is not installed: pip install 'mrt-mitsuba[validation]'"
     begin = "import sys; sys.modules['scipy'] = None\n"
@@ -117,6 +120,14 @@ def test_what_is_not_installed_is_named_with_the_way_to_install_it(run_python: C
     assert run_python(begin + command, code=1).stderr == f"mrt: {text}\n"
     found = run_python(begin + "import mrt_mitsuba as mrt; mrt.check_bsdf", code=1).stderr
     assert found.endswith(f"mrt_mitsuba.errors.MrtError: {text}\n")
+
+
+@pytest.mark.parametrize("word", ["target=0.01", "target=2%", "aa=2", "maxspp=64"])
+def test_what_an_xml_file_cannot_say_is_refused_by_export(tmp_path, capsys, word):
+    path = tmp_path / "x.xml"
+    assert cli.main(["export", "3", "--xml", str(path), word]) == 2
+    assert f"{word.partition('=')[0]} is of no use to mrt export" in capsys.readouterr().err
+    assert not path.exists()
 
 
 # What the signal meets: a Dr.Jit kernel that runs for minutes (a million steps per entry).
@@ -154,9 +165,7 @@ KERNEL = """
     ],
     ids=["kernel", "kernel next to python"],
 )
-def test_signal_leaves_the_old_file_and_does_not_wait_for_the_kernel(
-    start, tmp_path: Path, number: signal.Signals, code: int, work: str
-) -> None:
+def test_signal_leaves_the_old_file_and_does_not_wait_for_the_kernel(start, tmp_path, number, code, work):
     (tmp_path / "out.png").write_bytes(b"old")
     with start(sys.executable, "-c", IN_A_RENDER.format(work=work), "out", "format=png") as process:
         while "working" not in process.stdout.readline():
@@ -166,13 +175,15 @@ def test_signal_leaves_the_old_file_and_does_not_wait_for_the_kernel(
         process.wait(timeout=100)  # a third of the kernel's time
         errors = process.stderr.read()
     assert process.returncode == code, errors
-    assert errors.startswith("mrt: ") and errors.count("\n") == 1
+    assert errors.startswith("mrt: ")
+    assert errors.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["out.png"]
     assert (tmp_path / "out.png").read_bytes() == b"old"
 
 
-def test_bar_on_a_terminal_shows_the_time_left(monkeypatch) -> None:
-    messages, bars = io.StringIO(), io.StringIO()
+def test_bar_on_a_terminal_shows_the_time_left(monkeypatch):
+    messages = io.StringIO()
+    bars = io.StringIO()
     for stream in (messages, bars):
         monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
     with TerminalProgress(file=messages, bar_file=bars).stage("Rendering", 1000, "message") as advance:
@@ -181,11 +192,13 @@ def test_bar_on_a_terminal_shows_the_time_left(monkeypatch) -> None:
             advance(200)
     assert messages.getvalue() == "message\n"
     text = bars.getvalue()
-    assert "Rendering:" in text and "80%" in text and re.search(r"<\d\d:\d\d", text)
+    assert "Rendering:" in text
+    assert "80%" in text
+    assert re.search(r"<\d\d:\d\d", text)
     assert text.endswith("\r")  # cleared at the end
 
 
-def test_every_word_of_every_command_arrives() -> None:
+def test_every_word_of_every_command_arrives():
     """A command declares its words in its form, and its function takes each of them by name."""
     for name, (form, _, module, function) in registry.ALL.items():
         taken = inspect.signature(getattr(importlib.import_module(module), function)).parameters
@@ -197,7 +210,7 @@ def test_every_word_of_every_command_arrives() -> None:
         assert len(positional) == sum(w[0].isupper() for w in form.replace("--xml PATH", "").split()), name
 
 
-def test_words_reach_the_function_of_their_command(monkeypatch) -> None:
+def test_words_reach_the_function_of_their_command(monkeypatch):
     calls: list[tuple[tuple[str, ...], dict[str, str]]] = []
     fake = types.SimpleNamespace(work=lambda *plain, **given: calls.append((plain, given)) or 0)
     monkeypatch.setitem(sys.modules, "fake", fake)
@@ -212,7 +225,7 @@ def test_words_reach_the_function_of_their_command(monkeypatch) -> None:
         assert calls.pop() == call
 
 
-def test_every_option_arrives_at_the_render_or_is_the_commands_own() -> None:
+def test_every_option_arrives_at_the_render_or_is_the_commands_own():
     own = {"scene", "format", "tonemap", "plan", "quiet", "log"}
     assert {*options.parse(["o"]).render_arguments(), *own} == {*options.TABLE, "params"}
     assert set(options.parse(["o"]).render_arguments()) <= set(inspect.signature(api.render).parameters)

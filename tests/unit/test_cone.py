@@ -14,7 +14,8 @@ SHAPES = {
     "cone": {"type": "mrt_cone", "apex": [0.2, 1.5, -0.1], "base_center": [0.5, 0.4, 0.3], "radius": 0.65},
     "cylinder": {"type": "mrt_cylinder", "p0": [0.2, 1.5, -0.1], "p1": [0.5, 0.4, 0.3], "radius": 0.65},
 }
-HEIGHT, RADIUS = math.sqrt(0.3**2 + 1.1**2 + 0.4**2), 0.65
+HEIGHT = math.sqrt(0.3**2 + 1.1**2 + 0.4**2)
+RADIUS = 0.65
 AREA = {
     "cone": np.pi * RADIUS * (RADIUS + np.hypot(HEIGHT, RADIUS)),
     "cylinder": 2 * np.pi * RADIUS * (RADIUS + HEIGHT),
@@ -37,13 +38,13 @@ def area(mesh) -> float:
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_error_falls_with_the_square_of_segments(name: str) -> None:
+def test_error_falls_with_the_square_of_segments(name):
     """Each factor of four in segments is a factor of sixteen in the error of the area."""
     errors = np.array([abs(area(shape(name, segments=n)) / AREA[name] - 1) for n in (16, 64, 256)])
     assert errors[:-1] / errors[1:] == pytest.approx(16, abs=4)
 
 
-def test_open_cone_has_no_base() -> None:
+def test_open_cone_has_no_base():
     up = mi.Ray3f([0.5, -5, 0.5], [0, 1, 0])
     for capped, t in ((True, 5.4), (False, 5 + 1.5 - 1.1 * 0.2 / RADIUS)):
         cone = shape("cone", base_center=[0.5, 0.4, 0.3], apex=[0.5, 1.5, 0.3], capped=capped)
@@ -52,7 +53,7 @@ def test_open_cone_has_no_base() -> None:
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_positions_differentiate_with_the_parameters(name: str) -> None:
+def test_positions_differentiate_with_the_parameters(name):
     """Derivatives of all vertices by automatic differentiation against finite differences."""
     ends = [key for key in SHAPES[name] if key not in ("type", "radius")]
     weights = mi.Float(np.random.default_rng(4).normal(size=3 * shape(name, segments=8).vertex_count()))
@@ -75,7 +76,7 @@ def test_positions_differentiate_with_the_parameters(name: str) -> None:
         assert dr.grad(by)[0] == pytest.approx((above - below) / 2e-2, rel=2e-2, abs=2e-2)
 
 
-def test_shapes_of_one_material_stay_apart() -> None:
+def test_shapes_of_one_material_stay_apart():
     """Mitsuba merges meshes that share a material; a merged one would have lost its frame or equation."""
     kinds = SHAPES | {"plane": {"type": "mrt_plane", "normal": [0, 1, 0]}}
     paint = {"bsdf": {"type": "ref", "id": "paint"}}

@@ -7,6 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
+from cases import Cases
 from nodes import rgb, sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -59,27 +60,25 @@ def picture(scene: mi.Scene, **options: Any) -> np.ndarray:
     return np.array(mi.render(scene, integrator=integrator, spp=1, seed=3))
 
 
-@pytest.mark.parametrize(
-    ("content", "options"),
-    [
-        (balls(), {}),
-        (balls(sky={"type": "constant", "radiance": 1000.0}), {}),
-        (balls(), {"sky": 1000.0}),
-        (balls(light=LIGHT | {"intensity": 1e4}), {"clamp": False}),
-        (balls(light=LIGHT | {"type": "point", "intensity": 1e5}), {"clamp": False}),
-        (balls(lamp=LAMP), {}),
-        (mirrors(1.5, specular_reflectance=0.98, alpha=1.0) | hidden_lights(6, 3.5e-4), {}),
-        (hidden_lights(8, 5e-4) | {"floor": FLOOR}, {}),
-    ],
-    ids=["plain", "sky 1000", "own sky", "unclamped", "with falloff", "lamp", "mirrors", "lights"],
-)
-def test_what_is_cut_off_is_not_seen(content: dict[str, Any], options: dict[str, Any]) -> None:
+cut = Cases()
+cut(balls(), {}, name="plain")
+cut(balls(sky={"type": "constant", "radiance": 1000.0}), {}, name="sky 1000")
+cut(balls(), {"sky": 1000.0}, name="own sky")
+cut(balls(light=LIGHT | {"intensity": 1e4}), {"clamp": False}, name="unclamped")
+cut(balls(light=LIGHT | {"type": "point", "intensity": 1e5}), {"clamp": False}, name="with falloff")
+cut(balls(lamp=LAMP), {}, name="lamp")
+cut(mirrors(1.5, specular_reflectance=0.98, alpha=1.0) | hidden_lights(6, 3.5e-4), {}, name="mirrors")
+cut(hidden_lights(8, 5e-4) | {"floor": FLOOR}, {}, name="lights")
+
+
+@pytest.mark.parametrize(("content", "options"), cut)
+def test_what_is_cut_off_is_not_seen(content, options):
     scene = loaded(content)
     whole = picture(scene, min_contribution=0.0, **options)
     assert np.abs(whole - picture(scene, **options)).max() < STEP / 16
 
 
-def test_facing_planes_of_any_reflectance_give_numbers() -> None:
+def test_facing_planes_of_any_reflectance_give_numbers():
     """A throughput that leaves float32, times no light, is no light."""
     planes = mirrors(7.0, specular_reflectance=1e5)
     assert (picture(loaded(planes), max_depth=40) == 0).all()

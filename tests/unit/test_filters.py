@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from cases import Cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from mrt_mitsuba import UsageError, filters, runtime
@@ -41,7 +41,8 @@ def picture(size: tuple[int, int], seed: int, low: float, high: float) -> np.nda
     """Patches of one colour, so that flat neighbourhoods and edges both occur, with some speckles."""
     rng = np.random.default_rng(seed)
     patches = rng.uniform(low, high, (3, 3, 3))
-    rows, columns = np.arange(size[0]) * 3 // size[0], np.arange(size[1]) * 3 // size[1]
+    rows = np.arange(size[0]) * 3 // size[0]
+    columns = np.arange(size[1]) * 3 // size[1]
     image = patches[rows][:, columns]
     speckles = rng.random(size) < 0.1
     image[speckles] = rng.uniform(low, high, (speckles.sum(), 3))
@@ -57,21 +58,23 @@ TOLERANCES = {luma_edges: (1e-6, 2e-6), sobel_edges: (0, 4e-4)}
 @pytest.mark.parametrize("detector", DETECTORS)
 @given(data=st.data(), size=SIZES, seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=40)
-def test_detectors_equal_the_loops(backend: str, detector: Any, data: Any, size: Any, seed: int) -> None:
+def test_detectors_equal_the_loops(backend, detector, data, size, seed):
     """Weights, thresholds, truncation towards zero and the border that is never an edge, at any size."""
-    spans = [(0, 0.02), (0, 0.3), (0, 1), (0, 4)] + [(-0.02, 0.02), (-2, 4)] * (detector is sobel_edges)
+    spans = [(0, 0.02), (0, 0.3), (0, 1), (0, 4)]
+    if detector is sobel_edges:
+        spans += [(-0.02, 0.02), (-2, 4)]
     image = picture(size, seed, *data.draw(st.sampled_from(spans)))
     found = detector(tensor(backend, image))
     mask, value, margin = getattr(reference, detector.__name__)(image)
     assert found.mask.shape == found.value.shape == size
     atol, least = TOLERANCES[detector]
     decided = margin > least
-    np.testing.assert_allclose(np.array(found.value)[decided], value[decided], atol=atol, rtol=0)
-    np.testing.assert_array_equal(np.array(found.mask)[decided], mask[decided])
+    assert_allclose(np.array(found.value)[decided], value[decided], atol=atol, rtol=0)
+    assert_array_equal(np.array(found.mask)[decided], mask[decided])
 
 
 @pytest.mark.parametrize("detector", DETECTORS)
-def test_the_comparison_with_the_loops_decides_nearly_every_pixel(detector: Any) -> None:
+def test_the_comparison_with_the_loops_decides_nearly_every_pixel(detector):
     mask, _, margin = getattr(reference, detector.__name__)(picture((40, 50), 1, 0, 1))
     assert (margin > TOLERANCES[detector][1]).mean() > 0.95
     assert 0.1 < mask[1:-1, 1:-1].mean() < 0.9
@@ -88,27 +91,26 @@ def test_the_comparison_with_the_loops_decides_nearly_every_pixel(detector: Any)
         (0.401**2, {}, False),
     ],
 )
-def test_luma_refines_a_flat_picture_from_its_threshold_on(
-    level: float, options: dict[str, float], is_edge: bool
-) -> None:
+def test_luma_refines_a_flat_picture_from_its_threshold_on(level, options, is_edge):
     assert luma_edges(np.full((3, 3, 3), level), **options).mask[1, 1] == is_edge
 
 
-def test_luma_counts_a_negative_sum_as_black() -> None:
+def test_luma_counts_a_negative_sum_as_black():
     black, below = np.ones((2, 5, 5, 3))
-    black[2, 2], below[2, 2] = 0, -3
-    np.testing.assert_array_equal(luma_edges(black).value, luma_edges(below).value)
+    black[2, 2] = 0
+    below[2, 2] = -3
+    assert_array_equal(luma_edges(black).value, luma_edges(below).value)
 
 
 @pytest.mark.parametrize(("threshold", "is_edge"), [(0, True), (3.99, True), (4, False)])
-def test_sobel_needs_more_than_its_threshold(threshold: float, is_edge: bool) -> None:
+def test_sobel_needs_more_than_its_threshold(threshold, is_edge):
     step = np.tile(np.array([10.5, 10.5, 11.5, 11.5, 11.5])[:, None] / 255, (5, 1, 3))
     edges = sobel_edges(step, threshold=threshold)
     assert edges.value[2].tolist() == [0, 4, 4, 0, 0]  # one grey level times 1 + 2 + 1
     assert edges.mask[2].tolist() == [False, is_edge, is_edge, False, False]
 
 
-def test_noise_of_the_channels_adds_up_as_if_it_were_one() -> None:
+def test_noise_of_the_channels_adds_up_as_if_it_were_one():
     step = np.zeros((5, 6, 3))
     step[:, 3:] = 40 / 255
     deviations = np.array([1.0, 2.0, 3.0]) / 255
@@ -117,15 +119,17 @@ def test_noise_of_the_channels_adds_up_as_if_it_were_one() -> None:
     assert edges.value[2, 3] == int(4 * 40 - 2 * noise)
 
     luma = luma_edges(step + 0.25, variance=np.broadcast_to(deviations**2, (5, 6, 3)), noise_sigmas=2)
-    bright, dark = 0.25 + 40 / 255, 0.25
-    deviation = 0.299 * deviations[0] + 0.587 * deviations[1] + 0.114 * deviations[2]
-    noise = deviation * np.sqrt((6 / (4 * bright) + 3 / (4 * dark)) / 9)  # a right column of 3 dark pixels
+    bright = 0.25 + 40 / 255
+    dark = 0.25
+    deviation = np.dot([0.299, 0.587, 0.114], deviations)
+    nine = [1 / (4 * bright)] * 6 + [1 / (4 * dark)] * 3  # a right column of 3 dark pixels
+    noise = deviation * np.sqrt(np.mean(nine))
     expected = np.sqrt(bright) - np.sqrt(dark) - 2 * 2 * noise + 0.05
     assert luma.value[2, 3] == pytest.approx(expected, abs=1e-6)  # float32 roundings, as above
 
 
 @pytest.mark.parametrize("detector", DETECTORS)
-def test_noise_of_unknown_size_leaves_its_neighbourhood_alone(detector: Any) -> None:
+def test_noise_of_unknown_size_leaves_its_neighbourhood_alone(detector):
     image = np.random.default_rng(0).random((8, 9, 3))
     variance = np.zeros_like(image)
     variance[4, 4] = np.nan
@@ -133,24 +137,27 @@ def test_noise_of_unknown_size_leaves_its_neighbourhood_alone(detector: Any) -> 
     expected = np.pad(np.ones((6, 7), bool), 1)
     expected[3:6, 3:6] = False
     expected[4, 4] = detector is sobel_edges  # whose kernels do not read their centre
-    np.testing.assert_array_equal(edges.mask, expected)
+    assert_array_equal(edges.mask, expected)
     assert np.isfinite(edges.value).all()
 
 
-def test_geometry_leaves_a_floor_alone_up_to_its_horizon() -> None:
+def test_geometry_leaves_a_floor_alone_up_to_its_horizon():
     """However steeply it is seen; the camera looks along +z, one unit above it."""
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, 40), np.linspace(0.45, -0.45, 30))
     slope = y / np.sqrt(x**2 + y**2 + 1)
     depth = np.where(slope < 0, 1 / np.maximum(-slope, 1e-9), np.inf)
     edges = geometry_edges(np.tile([0.0, 1.0, 0.0], (30, 40, 1)), depth)
     assert edges.mask[14:16, 1:-1].all()  # the rows on both sides of the horizon, but for the border
-    assert edges.mask.sum() == 2 * 38 and not edges.value[:, [0, -1]].any()
+    assert edges.mask.sum() == 2 * 38
+    assert not edges.value[:, [0, -1]].any()
 
 
 def face(columns: slice = slice(0, 0), normal: Any = (0, 0, 1), depth: float = 3.0) -> tuple[np.ndarray, ...]:
     """Normals and distances of a wall that is seen from in front, other ones in some columns."""
-    normals, depths = np.tile([0.0, 0.0, 1.0], (5, 8, 1)), np.full((5, 8), 3.0)
-    normals[:, columns], depths[:, columns] = normal, depth
+    normals = np.tile([0.0, 0.0, 1.0], (5, 8, 1))
+    depths = np.full((5, 8), 3.0)
+    normals[:, columns] = normal
+    depths[:, columns] = depth
     return normals, depths
 
 
@@ -158,47 +165,47 @@ def tilted(degrees: float) -> tuple[float, float, float]:
     return np.sin(np.radians(degrees)), 0, np.cos(np.radians(degrees))
 
 
-@pytest.mark.parametrize(
-    ("change", "options", "is_edge"),
-    [
-        ({"normal": tilted(19.9)}, {}, False),
-        ({"normal": tilted(20.1)}, {}, True),
-        ({"normal": tilted(20.1)}, {"crease_angle": 30}, False),
-        # inverse distances 1/3 and (1 − step)/3, relative to the largest
-        ({"depth": 3 / (1 - 0.019)}, {}, False),
-        ({"depth": 3 / (1 - 0.021)}, {}, True),
-        ({"depth": 3 / (1 - 0.021)}, {"depth_step": 0.03}, False),
-        *(({"depth": miss, "normal": np.nan}, {}, True) for miss in (np.inf, 0.0, -1.0)),
-    ],
-)
-def test_geometry_decides_by_angle_step_and_miss(change: dict, options: dict, is_edge: bool) -> None:
+geometry = Cases()
+geometry({"normal": tilted(19.9)}, {}, False)
+geometry({"normal": tilted(20.1)}, {}, True)
+geometry({"normal": tilted(20.1)}, {"crease_angle": 30}, False)
+# inverse distances 1/3 and (1 − step)/3, relative to the largest
+geometry({"depth": 3 / (1 - 0.019)}, {}, False)
+geometry({"depth": 3 / (1 - 0.021)}, {}, True)
+geometry({"depth": 3 / (1 - 0.021)}, {"depth_step": 0.03}, False)
+for miss in (np.inf, 0.0, -1.0):
+    geometry({"depth": miss, "normal": np.nan}, {}, True)
+
+
+@pytest.mark.parametrize(("change", "options", "is_edge"), geometry)
+def test_geometry_decides_by_angle_step_and_miss(change, options, is_edge):
     edges = geometry_edges(*face(slice(4, None), **change), **options)
     assert edges.mask[2].tolist() == [False] * 3 + [is_edge] * 2 + [False] * 3
     assert np.isfinite(edges.value).all()
 
 
-def test_geometry_sees_a_step_in_every_direction() -> None:
+def test_geometry_sees_a_step_in_every_direction():
     normal, depth = face()
     depth[2, 4] = 2.9
-    np.testing.assert_array_equal(
-        geometry_edges(normal, depth).mask, np.pad(np.ones((3, 3)), [(1, 1), (3, 2)])
-    )
+    around = np.pad(np.ones((3, 3)), [(1, 1), (3, 2)])
+    assert_array_equal(geometry_edges(normal, depth).mask, around)
 
 
 MODES = ["report", "corrected"]
 SIXTEENTH = st.integers(0, 16 * 14).map(lambda n: n / 16)  # exact in float32, as are all amounts made of them
-ANY_PICTURE = given(
-    size=st.one_of(st.just((37, 41)), st.tuples(st.integers(1, 30), st.integers(1, 20))),
-    seed=st.integers(0, 2**32 - 1),
-    focus=st.fixed_dictionaries({"focal_distance": SIXTEENTH.filter(bool), "focal_range": SIXTEENTH}),
-)
+SMALL_SIZES = st.tuples(st.integers(1, 30), st.integers(1, 20))
+SEEDS = st.integers(0, 2**32 - 1)
+FOCUS = st.fixed_dictionaries({"focal_distance": SIXTEENTH.filter(bool), "focal_range": SIXTEENTH})
+ANY_PICTURE = given(size=st.one_of(st.just((37, 41)), SMALL_SIZES), seed=SEEDS, focus=FOCUS)
 
 
 def scene(size: tuple[int, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Colours, and distances in sixteenths from 0 to 14 in patches and speckles, with misses of all kinds."""
     rng = np.random.default_rng(seed)
-    depth = (rng.integers(0, 16 * 14, (3, 4)) / 16)[np.arange(size[0]) * 3 // size[0]]
-    depth = depth[:, np.arange(size[1]) * 4 // size[1]]
+    patches = rng.integers(0, 16 * 14, (3, 4)) / 16
+    rows = np.arange(size[0]) * 3 // size[0]
+    columns = np.arange(size[1]) * 4 // size[1]
+    depth = patches[rows][:, columns]
     speckles = rng.random(size) < 0.2
     depth[speckles] = rng.choice([1 / 16, 1, 2.5, 6, 12, 0, -1, np.inf], speckles.sum())
     return rng.uniform(-1, 1, (*size, 3)).astype(np.float32), depth
@@ -207,114 +214,127 @@ def scene(size: tuple[int, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(
     ("reach", "expected"), [({}, [0, 1, 8, 8, 8]), ({"focal_range": np.inf}, [0, 0, 8, 8, 8])]
 )
-def test_amount_of_bad_depths_and_misses(reach: dict[str, float], expected: list[float]) -> None:
+def test_amount_of_bad_depths_and_misses(reach, expected):
     """A depth that is no number is sharp, a miss blurred whatever the range, which is two unless given."""
     depth = np.array([[np.nan, 5.0, np.inf, 0.0, -3.0]])
     amount = blur_amount(depth, focal_distance=2.0, **reach)
-    assert amount.dtype == np.float32 and amount.tolist() == [expected]
+    assert amount.dtype == np.float32
+    assert amount.tolist() == [expected]
     assert not blur_amount(depth, focal_distance=None).any()
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @ANY_PICTURE
 @settings(max_examples=25)
-def test_report_equals_the_loops(backend: str, size: Any, seed: int, focus: dict[str, float]) -> None:
+def test_report_equals_the_loops(backend, size, seed, focus):
     """Windows of every size, cut at borders; what is in focus gives nothing; below k = 1 nothing is taken."""
     image, depth = scene(size, seed)
     found = np.array(gaussian_dof(tensor(backend, image), tensor(backend, depth), **focus))
     amount = reference.blur_amount(depth, **focus)
     # sums of up to 16 weighted values along rows, 16 along columns, and a quotient: 33 roundings of 6e-8
-    np.testing.assert_allclose(found, reference.gaussian_dof(image, amount), atol=2e-6, rtol=0)
-    np.testing.assert_array_equal(found[amount < 1], image[amount < 1])
+    assert_allclose(found, reference.gaussian_dof(image, amount), atol=2e-6, rtol=0)
+    assert_array_equal(found[amount < 1], image[amount < 1])
 
 
 @ANY_PICTURE
 @settings(max_examples=12)
-def test_corrected_equals_the_loops(size: Any, seed: int, focus: dict[str, float]) -> None:
+def test_corrected_equals_the_loops(size, seed, focus):
     """Discs of all sizes on both sides of the focus, layers near and far apart, borders."""
     image, depth = scene(size, seed)
     radius = reference.disc_radius(reference.blur_amount(depth, **focus))
     radius[(depth > 0) & (depth < focus["focal_distance"])] *= -1
     # float32 sums of up to 81 terms, and quotients of them
     found = gaussian_dof(image, depth, mode="corrected", **focus)
-    np.testing.assert_allclose(found, reference.corrected_dof(image, radius), atol=5e-6)
+    assert_allclose(found, reference.corrected_dof(image, radius), atol=5e-6)
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_bad_colour_gives_nothing(mode: str) -> None:
+def test_a_bad_colour_gives_nothing(mode):
     image = np.full((25, 30, 3), 0.75)
     image[12, 15, 2] = image[3, 0, 0] = np.nan
     good = np.isfinite(image).all(axis=-1)
     for amount in (np.full((25, 30), 8.0), np.arange(750.0).reshape(25, 30) % 9):
         found = gaussian_dof(image, 1 + amount, focal_distance=1.0, focal_range=0, mode=mode)
         # the weights of what is left add up to one, but for the rounding of their sums of 61 terms at most
-        np.testing.assert_allclose(found[good], 0.75, rtol=61 * 6e-8)
+        assert_allclose(found[good], 0.75, rtol=61 * 6e-8)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_arrays_give_arrays_of_their_kind(backend: str) -> None:
-    module, (image, depth) = importlib.import_module(f"drjit.{backend}"), scene((40, 50), 1)
+def test_arrays_give_arrays_of_their_kind(backend):
+    module = importlib.import_module(f"drjit.{backend}")
+    (image, depth) = scene((40, 50), 1)
     plain, listed, found = map(sobel_edges, (image, image.tolist(), tensor(backend, image)))
-    assert isinstance(plain.mask, np.ndarray) and plain.mask.dtype == bool
-    assert isinstance(plain.value, np.ndarray) and plain.value.dtype == np.float32
-    assert type(found.mask) is module.TensorXb and type(found.value) is module.TensorXf
-    np.testing.assert_array_equal(listed.mask, plain.mask)
+    assert isinstance(plain.mask, np.ndarray)
+    assert plain.mask.dtype == bool
+    assert isinstance(plain.value, np.ndarray)
+    assert plain.value.dtype == np.float32
+    assert type(found.mask) is module.TensorXb
+    assert type(found.value) is module.TensorXf
+    assert_array_equal(listed.mask, plain.mask)
     for mode in MODES:
         given_image = tensor(backend, image)
-        blurred, first, second = (
-            gaussian_dof(each, depth, focal_distance=3.0, focal_range=0.5, mode=mode)
-            for each in (image, given_image, given_image)
-        )
-        assert isinstance(blurred, np.ndarray) and blurred.dtype == np.float32
-        assert type(first) is module.TensorXf and first.shape == (40, 50, 3)
-        np.testing.assert_array_equal(np.array(first), np.array(second))
+        options = {"focal_distance": 3.0, "focal_range": 0.5, "mode": mode}
+        blurred = gaussian_dof(image, depth, **options)
+        first = gaussian_dof(given_image, depth, **options)
+        second = gaussian_dof(given_image, depth, **options)
+        assert isinstance(blurred, np.ndarray)
+        assert blurred.dtype == np.float32
+        assert type(first) is module.TensorXf
+        assert first.shape == (40, 50, 3)
+        assert_array_equal(np.array(first), np.array(second))
         # the same operations in the same order, but for fused multiply-adds: a rounding for each term
-        np.testing.assert_allclose(np.array(first), blurred, atol=61 * 6e-8)
-        np.testing.assert_array_equal(np.array(given_image), image)
+        assert_allclose(np.array(first), blurred, atol=61 * 6e-8)
+        assert_array_equal(np.array(given_image), image)
 
 
-def test_contours_stand_side_by_side_in_white_on_black(tmp_path: Path) -> None:
+def test_contours_stand_side_by_side_in_white_on_black(tmp_path):
     image = np.zeros((8, 12, 3), np.float32)
     image[:, 6:] = 1
-    luma, sobel = luma_edges(image, contrast_offset=0), sobel_edges(image)
+    luma = luma_edges(image, contrast_offset=0)
+    sobel = sobel_edges(image)
     sheet = filters.contours(luma, sobel)
-    assert sheet.shape == (8, 2 * 12 + 4, 3) and sheet.dtype == np.float32
+    assert sheet.shape == (8, 2 * 12 + 4, 3)
+    assert sheet.dtype == np.float32
     assert (sheet[:, 12:16] == 0.5).all()
     for edges, part in ((luma, sheet[:, :12]), (sobel, sheet[:, 16:])):
-        assert edges.mask[3, 5] and edges.mask[3, 6] and not edges.mask[3, 3]
+        assert edges.mask[3, 5]
+        assert edges.mask[3, 6]
+        assert not edges.mask[3, 3]
         for channel in (edges_image(edges), *np.moveaxis(part, -1, 0)):
-            np.testing.assert_array_equal(channel, edges.mask)
+            assert_array_equal(channel, edges.mask)
     for ending in ("png", "exr"):
         filters.save_contours(tmp_path / f"contours.{ending}", luma, sobel)
-    np.testing.assert_array_equal(read_exr(tmp_path / "contours.exr").image, sheet)
+    assert_array_equal(read_exr(tmp_path / "contours.exr").image, sheet)
     with Image.open(tmp_path / "contours.png") as png:
         assert np.unique(np.asarray(png)).tolist() == [0, 127, 255]
 
 
-IMAGE, DEPTH = np.zeros((4, 5, 3)), np.zeros((4, 5))
+IMAGE = np.zeros((4, 5, 3))
+DEPTH = np.zeros((4, 5))
 SHAPES = [(), (4,), (4, 5), (4, 5, 4), (4, 5, 1), (3, 4, 5, 3), (0, 5, 3), (5, 0, 3)]
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        *((partial(find, np.zeros(shape)), "image has shape") for find in DETECTORS for shape in SHAPES),
-        (partial(luma_edges, IMAGE, variance=IMAGE[:, 1:]), r"variance has shape \(4, 4, 3\); expected \[4"),
-        (partial(sobel_edges, IMAGE, variance=IMAGE, noise_sigmas=-1), "noise_sigmas=-1"),
-        (partial(sobel_edges, IMAGE, threshold=np.nan), "threshold is not a number"),
-        (partial(luma_edges, IMAGE, relative_threshold=np.nan), "relative_threshold is not a number"),
-        (partial(geometry_edges, IMAGE, DEPTH[:2]), "depth has shape"),
-        (partial(geometry_edges, IMAGE, DEPTH, crease_angle=0), "crease_angle=0"),
-        (partial(geometry_edges, IMAGE, DEPTH, depth_step=0), "depth_step=0"),
-        (partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, mode="lens"), "use one of report, cor"),
-        (partial(gaussian_dof, IMAGE, DEPTH, focal_distance=np.nan), "focal_distance is not a number"),
-        (partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, focal_range=np.nan), "focal_range is not a"),
-        (partial(gaussian_dof, IMAGE, DEPTH.T, focal_distance=1), r"shape \(5, 4\); expected \[4, 5\]"),
-        (partial(gaussian_dof, DEPTH, DEPTH, focal_distance=1), "image has shape"),
-        (filters.contours, r"at least one; given: \[\]"),
-        (lambda: filters.contours(sobel_edges(IMAGE), sobel_edges(IMAGE[1:])), r"one height.*\[3, 4\]"),
-    ],
-)
-def test_wrong_arguments_are_named(call: Callable[[], Any], message: str) -> None:
+wrong = Cases()
+for find in DETECTORS:
+    for shape in SHAPES:
+        wrong(partial(find, np.zeros(shape)), "image has shape")
+wrong(partial(luma_edges, IMAGE, variance=IMAGE[:, 1:]), r"variance has shape \(4, 4, 3\); expected \[4")
+wrong(partial(sobel_edges, IMAGE, variance=IMAGE, noise_sigmas=-1), "noise_sigmas=-1")
+wrong(partial(sobel_edges, IMAGE, threshold=np.nan), "threshold is not a number")
+wrong(partial(luma_edges, IMAGE, relative_threshold=np.nan), "relative_threshold is not a number")
+wrong(partial(geometry_edges, IMAGE, DEPTH[:2]), "depth has shape")
+wrong(partial(geometry_edges, IMAGE, DEPTH, crease_angle=0), "crease_angle=0")
+wrong(partial(geometry_edges, IMAGE, DEPTH, depth_step=0), "depth_step=0")
+wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, mode="lens"), "use one of report, cor")
+wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=np.nan), "focal_distance is not a number")
+wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, focal_range=np.nan), "focal_range is not a")
+wrong(partial(gaussian_dof, IMAGE, DEPTH.T, focal_distance=1), r"shape \(5, 4\); expected \[4, 5\]")
+wrong(partial(gaussian_dof, DEPTH, DEPTH, focal_distance=1), "image has shape")
+wrong(filters.contours, r"at least one; given: \[\]")
+wrong(lambda: filters.contours(sobel_edges(IMAGE), sobel_edges(IMAGE[1:])), r"one height.*\[3, 4\]")
+
+
+@pytest.mark.parametrize(("call", "message"), wrong)
+def test_wrong_arguments_are_named(call, message):
     with pytest.raises(UsageError, match=message):
         call()

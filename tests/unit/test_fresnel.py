@@ -8,6 +8,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from mpmath import mp
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mrt_mitsuba.plugins.fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
 from mrt_mitsuba.validation.oracles import exact
@@ -25,22 +26,28 @@ def float32(values) -> drjit.scalar.ArrayXf:
 def relative_errors(found, truth: list) -> np.ndarray:
     """Return the errors of float32 numbers against 50-digit ones, which are not zero."""
     pairs = zip(np.array(found), truth, strict=True)
-    return np.array([float(abs(exact.number(a) - b) / b) for a, b in pairs])
+    errors = [abs(exact.number(a) - b) / b for a, b in pairs]
+    return np.array(errors, float)
 
 
-def test_schlick_and_its_f0_keep_their_digits() -> None:
+def test_schlick_and_its_f0_keep_their_digits():
     """F₀ next to an index of 1 is a small difference's square; the exact form is the stability study's."""
-    near_one, large, small = (10 ** np.linspace(*ends, 400) for ends in ((-6.5, -2), (0.01, 6), (-9, -0.2)))
-    etas = np.concatenate([1 + near_one, large, small]).astype(np.float32)
+    near_one = 1 + np.logspace(-6.5, -2, 400)
+    large = np.logspace(0.01, 6, 400)
+    small = np.logspace(-9, -0.2, 400)
+    etas = np.concatenate([near_one, large, small]).astype(np.float32)
     truth = [exact.f0_from_ior(1, eta) for eta in etas]
-    assert relative_errors(f0_from_ior(float32(np.ones(len(etas))), float32(etas)), truth).max() < 4e-7
+    found = f0_from_ior(float32(np.ones(len(etas))), float32(etas))
+    assert relative_errors(found, truth).max() < 4e-7
     rng = np.random.default_rng(1)
-    cosines, f0 = (10 ** rng.uniform(-least, 0, 400).astype(np.float32) for least in (7, 8))
+    cosines = 10 ** rng.uniform(-7, 0, 400).astype(np.float32)
+    f0 = 10 ** rng.uniform(-8, 0, 400).astype(np.float32)
     truth = [exact.fresnel_schlick(c, f) for c, f in zip(cosines, f0, strict=True)]
-    assert relative_errors(fresnel_schlick(float32(cosines), float32(f0)), truth).max() < 6e-7
+    found = fresnel_schlick(float32(cosines), float32(f0))
+    assert relative_errors(found, truth).max() < 6e-7
 
 
-def test_sine_serves_where_the_cosine_is_rounded_to_one() -> None:
+def test_sine_serves_where_the_cosine_is_rounded_to_one():
     """Near the normal there still are Schlick's (1 − cos θ)⁵ and a critical angle."""
     s2 = float32(10 ** np.linspace(-12, -4, 80))
     sines = [exact.number(s) for s in np.array(s2)]
@@ -48,20 +55,21 @@ def test_sine_serves_where_the_cosine_is_rounded_to_one() -> None:
     assert (np.array(c) == 1).sum() > 40
     truth = [float((s / (1 + mp.sqrt(1 - s))) ** 5) for s in sines]
     # the fifth power of three roundings; below 1e-37 float32 ends
-    np.testing.assert_allclose(np.array(fresnel_schlick(c, 0, s2)), truth, rtol=2e-6, atol=1e-37)
+    assert_allclose(np.array(fresnel_schlick(c, 0, s2)), truth, rtol=2e-6, atol=1e-37)
     ones = float32(np.ones(80))
     reflected = fresnel_dielectric(c, ones, 1e-5 * ones, s2)
-    np.testing.assert_array_equal(np.array(reflected) == 1, np.array(s2) >= 1e-10)
+    assert_array_equal(np.array(reflected) == 1, np.array(s2) >= 1e-10)
 
 
 @given(cos_theta=COSINES, n1=INDICES, n2=INDICES)
 @example(cos_theta=0.0, n1=1.0, n2=1.5)
 @example(cos_theta=1.0, n1=1.0, n2=1.5)
 @example(cos_theta=0.5, n1=1.3, n2=1.3)
-def test_float64_is_that_of_fifty_digits(cos_theta: float, n1: float, n2: float) -> None:
+def test_float64_is_that_of_fifty_digits(cos_theta, n1, n2):
     """And so between 0 and 1, the same from both sides, and decided by the ratio of the indices."""
     # next to the critical angle, F changes with the root of what is missing
-    assume(abs(n1**2 * (1 - cos_theta**2) - n2**2) > 1e-6 * n1**2)
+    beyond = n1**2 * (1 - cos_theta**2) - n2**2
+    assume(abs(beyond) > 1e-6 * n1**2)
     truth = float(exact.fresnel_dielectric(cos_theta, n1, n2))
     assert fresnel_dielectric(cos_theta, n1, n2) == pytest.approx(truth, rel=1e-9, abs=ROUNDING)
     f0 = float(exact.f0_from_ior(n1, n2))

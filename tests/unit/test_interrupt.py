@@ -24,7 +24,7 @@ def heeded() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-def test_handlers_and_threads_are_as_before() -> None:
+def test_handlers_and_threads_are_as_before():
     handlers = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
     threads = set(threading.enumerate())
     with ending_soon(lambda: None):
@@ -35,7 +35,7 @@ def test_handlers_and_threads_are_as_before() -> None:
     assert signal.set_wakeup_fd(-1) == -1
 
 
-def test_orderly_end_is_left_alone() -> None:
+def test_orderly_end_is_left_alone():
     """A program that ends by itself in time is not ended by force: this very process goes on."""
     called = []
     with pytest.raises(Terminated), ending_soon(lambda: called.append("by force")):
@@ -46,7 +46,7 @@ def test_orderly_end_is_left_alone() -> None:
 @pytest.mark.parametrize(
     ("number", "kind"), [(signal.SIGTERM, Terminated), (signal.SIGINT, KeyboardInterrupt)]
 )
-def test_error_that_a_library_makes_of_it_is_undone(number: signal.Signals, kind: type) -> None:
+def test_error_that_a_library_makes_of_it_is_undone(number, kind):
     """Dr.Jit raises ``RuntimeError`` where it is interrupted while it records a loop."""
     with pytest.raises(KeyboardInterrupt) as found, ending_soon(lambda: None):
         try:
@@ -56,19 +56,20 @@ def test_error_that_a_library_makes_of_it_is_undone(number: signal.Signals, kind
     assert found.type is kind
 
 
-def test_a_held_interrupt_comes_at_the_end_of_the_block() -> None:
+def test_a_held_interrupt_comes_at_the_end_of_the_block():
     """Raised while Mitsuba is imported, it ended the process in nanobind's code."""
     done = []
     with pytest.raises(KeyboardInterrupt), interrupts.held():
         signal.raise_signal(signal.SIGINT)
         done.append("all of the block")
-    assert done and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert done
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with interrupts.held():
         signal.raise_signal(signal.SIGINT)  # ignored before, and still
 
 
-def test_a_held_interrupt_is_heeded_at_safe_places_and_a_second_one_anywhere(monkeypatch) -> None:
+def test_a_held_interrupt_is_heeded_at_safe_places_and_a_second_one_anywhere(monkeypatch):
     done = []
     with pytest.raises(KeyboardInterrupt), interrupts.held():
         with interrupts.held():
@@ -83,20 +84,24 @@ def test_a_held_interrupt_is_heeded_at_safe_places_and_a_second_one_anywhere(mon
         done.append("waits")
         signal.raise_signal(signal.SIGINT)
         done.append("never")
-    assert done[1:] == ["waits"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert done[1:] == ["waits"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     interrupts.heed()  # nothing is left
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
-def test_mi_render_leaves_no_handler(variant: str) -> None:
+def test_mi_render_leaves_no_handler(variant):
     """Mitsuba's, left behind, called itself for ever at the next Ctrl-C, or an integrator that was gone."""
     handler = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_int)(("PyOS_getsig", ctypes.pythonapi))
-    before, nodes = handler(signal.SIGINT), scene_dict(0, width=8, height=6)
+    before = handler(signal.SIGINT)
+    nodes = scene_dict(0, width=8, height=6)
     nodes["integrator"] = {"type": "mrt_whitted", "max_depth": 1}
     params = mi.traverse(scene := mi.load_dict(nodes))
-    assert np.array(mi.render(scene, params, spp=1)).any() and handler(signal.SIGINT) == before
+    assert np.array(mi.render(scene, params, spp=1)).any()
+    assert handler(signal.SIGINT) == before
     if variant != "scalar_rgb":
         key = next(key for key, _ in params if "reflectance" in key)
         dr.enable_grad(params[key])
         dr.backward(dr.mean(mi.render(scene, params, spp=1)))
-        assert np.isfinite(dr.grad(params[key])).all() and handler(signal.SIGINT) == before
+        assert np.isfinite(dr.grad(params[key])).all()
+        assert handler(signal.SIGINT) == before

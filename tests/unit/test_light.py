@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from nodes import mesh, sensor
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mrt_mitsuba.plugins import plugin
 
@@ -49,36 +50,43 @@ def stock_spectrum(intensity: Any) -> np.ndarray:
 
 
 @in_variants
-def test_colour_does_not_depend_on_the_distance(variant: str) -> None:
+def test_colour_does_not_depend_on_the_distance(variant):
     towards = np.array([2, 3, 6]) / 7
     for distance in (1e-6, 1, 1e6):
         it = light(position=[0, 0, 0], intensity=2.5)
         ds, weight = it.sample_direction(point_at(-distance * towards), mi.Point2f(0.5))
-        np.testing.assert_allclose(spectrum(weight), stock_spectrum(2.5), rtol=1e-6)
-        np.testing.assert_allclose(np.ravel(ds.d), towards, rtol=1e-6)
-        np.testing.assert_allclose(np.ravel(ds.n), -towards, rtol=1e-6)
+        assert_allclose(spectrum(weight), stock_spectrum(2.5), rtol=1e-6)
+        assert_allclose(np.ravel(ds.d), towards, rtol=1e-6)
+        assert_allclose(np.ravel(ds.n), -towards, rtol=1e-6)
         assert np.array(ds.dist) == pytest.approx(distance, rel=1e-6)
-        assert np.array(ds.pdf) == 1 and dr.all(ds.delta) and np.array(ds.time) == 0.25
-    it, one = light(intensity=2.0), point_at(np.array(POSITION) - towards)
+        assert np.array(ds.pdf) == 1
+        assert dr.all(ds.delta)
+        assert np.array(ds.time) == 0.25
+    it = light(intensity=2.0)
+    one = point_at(np.array(POSITION) - towards)
     ds, _ = it.sample_direction(one, mi.Point2f(0.5))
-    np.testing.assert_array_equal(np.ravel(ds.p), POSITION)
-    np.testing.assert_allclose(spectrum(it.eval_direction(one, ds)), stock_spectrum(2.0), rtol=1e-6)
-    assert np.array(it.pdf_direction(one, ds)) == 0 and (spectrum(it.eval(one)) == 0).all()
-    assert mi.has_flag(it.flags(), mi.EmitterFlags.DeltaPosition) and not it.is_environment()
+    assert_array_equal(np.ravel(ds.p), POSITION)
+    assert_allclose(spectrum(it.eval_direction(one, ds)), stock_spectrum(2.0), rtol=1e-6)
+    assert np.array(it.pdf_direction(one, ds)) == 0
+    assert (spectrum(it.eval(one)) == 0).all()
+    assert mi.has_flag(it.flags(), mi.EmitterFlags.DeltaPosition)
+    assert not it.is_environment()
     ds, _ = light().sample_direction(point_at(POSITION), mi.Point2f(0.5))
     assert np.linalg.norm(np.ravel(ds.d)) == pytest.approx(1)  # there is none, and any will do
 
 
-def test_light_tracing_is_refused_where_there_is_one() -> None:
+def test_light_tracing_is_refused_where_there_is_one():
     """Dr.Jit asks all lights of the process: other scenes could not be rendered while one was there."""
-    box, tracer, other = mi.cornell_box(), mi.load_dict({"type": "ptracer"}), light()
+    box = mi.cornell_box()
+    tracer = mi.load_dict({"type": "ptracer"})
+    other = light()
     box["sensor"]["film"] |= {"width": 4, "height": 4}
     assert mi.render(mi.load_dict(box), integrator=tracer, spp=4).numpy().mean() > 0
     with pytest.raises(NotImplementedError, match="light tracing needs a finite emitted power"):
         tracer.render(mi.load_dict(box | {"other": other}), spp=4)
 
 
-def test_other_kinds_of_lights_join_the_table() -> None:
+def test_other_kinds_of_lights_join_the_table():
     """Next to ``mrt_light``, and by themselves: the picture is that of calls to each."""
 
     class LeaningLight(plugin("light").MrtLight):  # type: ignore[misc]
@@ -92,22 +100,24 @@ def test_other_kinds_of_lights_join_the_table() -> None:
     mi.register_emitter("leaning", LeaningLight)
     for kinds in (["leaning"], ["mrt_light", "leaning"], ["leaning", "mrt_light"]):
         used = [kinds[k % len(kinds)] for k in range(9)]
-        scene = mi.load_dict({
-            "type": "scene",
-            "integrator": {"type": "mrt_whitted", "max_depth": 1, "min_contribution": 0.0},
-            "sensor": sensor([0, 0, 5], [0, 0, 0], (32, 24)),
-            "floor": {"type": "mrt_plane", "normal": [0, 0, 1], "bsdf": {"type": "mrt_bsdf"}},
-            **{f"light{k}": light(type=t, position=[k - 4, 0, 3], intensity=0.1) for k, t in enumerate(used)},
-        })  # fmt: skip
-        image, integrator = np.array(mi.render(scene, spp=1)), scene.integrator()
+        nodes: dict[str, Any] = {"type": "scene"}
+        nodes["integrator"] = {"type": "mrt_whitted", "max_depth": 1, "min_contribution": 0.0}
+        nodes["sensor"] = sensor([0, 0, 5], [0, 0, 0], (32, 24))
+        nodes["floor"] = {"type": "mrt_plane", "normal": [0, 0, 1], "bsdf": {"type": "mrt_bsdf"}}
+        for k, kind in enumerate(used):
+            nodes[f"light{k}"] = light(type=kind, position=[k - 4, 0, 3], intensity=0.1)
+        scene = mi.load_dict(nodes)
+        image = np.array(mi.render(scene, spp=1))
+        integrator = scene.integrator()
         plan = integrator.prepare(scene).plan
-        assert plan.lights == "table" and image.std() > 1e-3
+        assert plan.lights == "table"
+        assert image.std() > 1e-3
         integrator.kernel_plan = lambda facts, plan=plan: replace(plan, lights="loop")
-        np.testing.assert_allclose(image, np.array(mi.render(scene, spp=1)), atol=1e-6)
+        assert_allclose(image, np.array(mi.render(scene, spp=1)), atol=1e-6)
 
 
 @in_variants
-def test_parameters_can_be_updated(variant: str) -> None:
+def test_parameters_can_be_updated(variant):
     it = light()
     assert list(it.bbox().min) == list(it.bbox().max) == list(POSITION)
     parameters = mi.traverse(it)
@@ -117,8 +127,8 @@ def test_parameters_can_be_updated(variant: str) -> None:
         parameters["intensity.value"] = 4.0
     parameters.update()
     ds, weight = it.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
-    np.testing.assert_allclose(np.ravel(ds.d), [0, 0, 1])
-    np.testing.assert_allclose(spectrum(weight), stock_spectrum(1.0 if mi.is_spectral else 4.0), rtol=1e-6)
+    assert_allclose(np.ravel(ds.d), [0, 0, 1])
+    assert_allclose(spectrum(weight), stock_spectrum(1.0 if mi.is_spectral else 4.0), rtol=1e-6)
     assert list(it.bbox().min) == [0, 0, 2]
 
 
@@ -136,44 +146,51 @@ def ball(s: float) -> dict[str, Any]:
     return {"type": "sphere", "radius": s}
 
 
-# A shape of size s, where on it the light is, and the direction off it
-SURFACES: dict[str, tuple[Callable[[float], dict[str, Any]], list[float], list[float]]] = {
-    "sphere": (ball, [-0.26726124, -0.53452248, -0.80178373], [-0.27, -0.53, -0.8]),
-    "cone apex": (upright("cone"), [0, 1, 0], [0, 1, 0]),
-    "cone base": (upright("cone"), [0.3, 0, 0.2], [0, -1, 0]),
-    "cone side": (upright("cone"), [-0.3, 0.5, -0.4], [-0.42, 0.71, -0.57]),
-    "cylinder end": (upright("cylinder"), [0.3, 1, 0.2], [0, 1, 0]),
-    "cylinder side": (upright("cylinder"), [-0.6, 0.5, -0.8], [-0.6, 0, -0.8]),
-    "plane": (ball, [2, -2, 1], [0, 1, 0]),
-    "rectangle": (
-        lambda s: {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -60).scale(s)},
-        [0.3, 0.1, 3**0.5 * -0.1],
-        [0, 0.75**0.5, 0.5],
-    ),
-    "triangle": (wedge, [0.1, 0.4, 0.6], [0, 0.71, 0.71]),
-    "corner": (wedge, [0, 1, 0], [0, 1, 0]),
+def leaning(s: float) -> dict[str, Any]:
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], -60).scale(s)
+    return {"type": "rectangle", "to_world": turned}
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface with a light on it."""
+
+    shape: Callable[[float], dict[str, Any]]  #: of a size
+    light: list[float]  #: place on the shape of size 1
+    out: list[float]  #: direction off the surface there
+
+
+SURFACES = {
+    "sphere": Surface(ball, [-0.26726124, -0.53452248, -0.80178373], [-0.27, -0.53, -0.8]),
+    "plane": Surface(ball, [2, -2, 1], [0, 1, 0]),
 }
+SURFACES["cone apex"] = Surface(upright("cone"), [0, 1, 0], [0, 1, 0])
+SURFACES["cone base"] = Surface(upright("cone"), [0.3, 0, 0.2], [0, -1, 0])
+SURFACES["cone side"] = Surface(upright("cone"), [-0.3, 0.5, -0.4], [-0.42, 0.71, -0.57])
+SURFACES["cylinder end"] = Surface(upright("cylinder"), [0.3, 1, 0.2], [0, 1, 0])
+SURFACES["cylinder side"] = Surface(upright("cylinder"), [-0.6, 0.5, -0.8], [-0.6, 0, -0.8])
+SURFACES["rectangle"] = Surface(leaning, [0.3, 0.1, 3**0.5 * -0.1], [0, 0.75**0.5, 0.5])
+SURFACES["triangle"] = Surface(wedge, [0.1, 0.4, 0.6], [0, 0.71, 0.71])
+SURFACES["corner"] = Surface(wedge, [0, 1, 0], [0, 1, 0])
 
 
 def lit_from_a_surface(name: str, s: float, lift: float = 0.0) -> np.ndarray:
     """Where it is lit: a shape over a floor, before two walls; its light is on it, or so many sizes above."""
-    shape, position, out = SURFACES[name]
+    surface = SURFACES[name]
     clips = {"near_clip": 0.01 * s, "far_clip": 1e4 * s}
-    place = s * (np.array(position) + lift * np.array(out))
-    scene = mi.load_dict({
-        "type": "scene", "shape": shape(s),
-        "sensor": sensor([2 * s, 3 * s, 6 * s], [0, 0.3 * s, 0], (96, 72), fov=40, **clips),
-        "integrator": {"type": "mrt_whitted", "max_depth": 1},
-        "light": {"type": "mrt_light", "position": place.tolist()},
-        "floor": {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 2 * s},
-        "wall": {"type": "mrt_plane", "normal": [1, 0, 0], "distance": 4 * s},
-        "back": {"type": "mrt_plane", "normal": [0, 0, 1], "distance": 4 * s},
-    })  # fmt: skip
-    return np.array(mi.render(scene, spp=1)) > 1e-3
+    place = s * (np.array(surface.light) + lift * np.array(surface.out))
+    nodes = {"type": "scene", "shape": surface.shape(s)}
+    nodes["sensor"] = sensor([2 * s, 3 * s, 6 * s], [0, 0.3 * s, 0], (96, 72), fov=40, **clips)
+    nodes["integrator"] = {"type": "mrt_whitted", "max_depth": 1}
+    nodes["light"] = {"type": "mrt_light", "position": place.tolist()}
+    nodes["floor"] = {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 2 * s}
+    nodes["wall"] = {"type": "mrt_plane", "normal": [1, 0, 0], "distance": 4 * s}
+    nodes["back"] = {"type": "mrt_plane", "normal": [0, 0, 1], "distance": 4 * s}
+    return np.array(mi.render(mi.load_dict(nodes), spp=1)) > 1e-3
 
 
 @pytest.mark.parametrize("name", SURFACES)
-def test_a_light_on_a_surface_shines_at_every_scale(name: str) -> None:
+def test_a_light_on_a_surface_shines_at_every_scale(name):
     """Both sides are lit, as by one a thousandth above and one below, without speckles, in any unit."""
     image, above, below = (lit_from_a_surface(name, 1.0, lift) for lift in (0.0, 1e-3, -1e-3))
     assert 0.1 < image.mean() < 0.95
@@ -182,3 +199,21 @@ def test_a_light_on_a_surface_shines_at_every_scale(name: str) -> None:
         assert (other != image).any(axis=-1).mean() < 1e-3  # a pixel at a shadow's edge
     # From that much higher, the sphere's horizon is 0.045 radii away
     assert (above | below != image).any(axis=-1).mean() < 0.03
+
+
+def test_a_moved_light_needs_no_new_kernel():
+    """Its place is data of the kernels, whichever integrator draws it."""
+    nodes = {"type": "scene", "integrator": {"type": "direct"}, "light": {"type": "mrt_light"}}
+    nodes["sensor"] = sensor([0, 0, 5], [0, 0, 0], (8, 6))
+    nodes["floor"] = {"type": "rectangle"}
+    scene = mi.load_dict(nodes)
+    parameters = mi.traverse(scene)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for place in ([1, 0, 2], [0, 1, 2], [0.5, 0.25, 3]):
+            parameters["light.position"] = place
+            parameters.update()
+            dr.kernel_history_clear()
+            dr.eval(mi.render(scene, spp=1))
+    kernels = dr.kernel_history([dr.KernelType.JIT])  # of the last picture
+    assert kernels
+    assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)

@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from cases import Cases
 
 from mrt_mitsuba import llvm
 
@@ -29,21 +30,19 @@ def wheel(prefix: Path, name: str = "libLLVM.so.23.1") -> tuple[str, str]:
 
 # What DRJIT_LIBLLVM_PATH names, the wheel's library, those of the system, the choice, and how many are passed
 # over; names of files, "" for none
-CHOICES = [
-    ("libLLVM.so.18.1", "libLLVM.so.23.1", "libLLVM-99.so.1", "libLLVM.so.18.1", 0),
-    ("", "libLLVM.so.23.1", "libLLVM-99.so.1", "libLLVM.so.23.1", 0),
-    ("", "", "libLLVM-15.so.1 libLLVM-9.so.1 libLLVM.so.20.1 libLLVM.so.19.1", "libLLVM.so.20.1", 0),
-    *(("libLLVM-16.so.1", "libLLVM.so.16.0", f"libLLVM-{v}.so.1", "", 3) for v in (14, 15, 16)),
-    ("", "", "libLLVM-17.so.1", "libLLVM-17.so.1", 0),
-    ("", "libLLVM.so.16.0", "libLLVM-17.so.1", "libLLVM-17.so.1", 1),
-    ("", "", "libLLVM-18.1.8.so.1 libLLVM-20git.so libclang-21.so", "libLLVM-18.1.8.so.1", 0),
-]
+choices = Cases()
+choices("libLLVM.so.18.1", "libLLVM.so.23.1", "libLLVM-99.so.1", "libLLVM.so.18.1", 0)
+choices("", "libLLVM.so.23.1", "libLLVM-99.so.1", "libLLVM.so.23.1", 0)
+choices("", "", "libLLVM-15.so.1 libLLVM-9.so.1 libLLVM.so.20.1 libLLVM.so.19.1", "libLLVM.so.20.1", 0)
+for v in (14, 15, 16):
+    choices("libLLVM-16.so.1", "libLLVM.so.16.0", f"libLLVM-{v}.so.1", "", 3)
+choices("", "", "libLLVM-17.so.1", "libLLVM-17.so.1", 0)
+choices("", "libLLVM.so.16.0", "libLLVM-17.so.1", "libLLVM-17.so.1", 1)
+choices("", "", "libLLVM-18.1.8.so.1 libLLVM-20git.so libclang-21.so", "libLLVM-18.1.8.so.1", 0)
 
 
-@pytest.mark.parametrize(("named", "packed", "system", "chosen", "passed_over"), CHOICES)
-def test_the_rule(
-    tmp_path: Path, named: str, packed: str, system: str, chosen: str, passed_over: int
-) -> None:
+@pytest.mark.parametrize(("named", "packed", "system", "chosen", "passed_over"), choices)
+def test_the_rule(tmp_path, named, packed, system, chosen, passed_over):
     environ = {llvm.VARIABLE: library(tmp_path / "mine", named)} if named else {}
     site = [wheel(tmp_path / "venv", packed)[0]] if packed else []
     for name in system.split():
@@ -56,14 +55,14 @@ def test_the_rule(
 
 
 @pytest.mark.parametrize("named", ["/no/such/libLLVM.so.19.1", "/usr", "libLLVM-99-nowhere.so"])
-def test_unusable_user_path_falls_through(tmp_path: Path, named: str) -> None:
+def test_unusable_user_path_falls_through(tmp_path, named):
     site, path = wheel(tmp_path / "venv")
     choice = llvm.choose({llvm.VARIABLE: named}, [site], [])
     assert (choice.path, choice.rejected) == (path, [f"{named}, named by {llvm.VARIABLE}, cannot be loaded"])
     assert choice.describe().startswith("LLVM 23.1, from the package karellen-llvm-core")
 
 
-def test_broken_metadata_and_folders_are_passed_over(tmp_path: Path) -> None:
+def test_broken_metadata_and_folders_are_passed_over(tmp_path):
     site, path = wheel(tmp_path / "venv")
     for name in "ab":
         (tmp_path / name / "karellen_llvm_core-1.dist-info").mkdir(parents=True)
@@ -74,19 +73,20 @@ def test_broken_metadata_and_folders_are_passed_over(tmp_path: Path) -> None:
     assert llvm.choose({llvm.VARIABLE: str(loop)}, places, []).path == path
 
 
-def test_unfinished_installation_is_not_used(tmp_path: Path) -> None:
+def test_unfinished_installation_is_not_used(tmp_path):
     """So it is after the superuser installed, until Python first starts with the right to write there."""
     site, path = wheel(tmp_path / "venv")
     info = next(Path(site).iterdir())
     (info / "symlinks.txt").touch()
     for environ in ({}, {llvm.VARIABLE: path}):
         choice = llvm.choose(environ, [site], [str(Path(path).parent)])
-        assert choice.path is None and "is unfinished: whoever may write" in choice.describe()
+        assert choice.path is None
+        assert "is unfinished: whoever may write" in choice.describe()
     (info / "axle.done").touch()
     assert llvm.choose({}, [site], []).path == path
 
 
-def test_inherited_choice_is_not_taken_for_the_users(tmp_path: Path) -> None:
+def test_inherited_choice_is_not_taken_for_the_users(tmp_path):
     site, path = wheel(tmp_path / "venv")
     assert llvm.choose({llvm.VARIABLE: path}, [site], []).source == f"from the package {llvm.WHEEL}"
     assert llvm.choose({llvm.VARIABLE: llvm.BLOCKED}, [], []).rejected == []
@@ -96,9 +96,7 @@ def test_inherited_choice_is_not_taken_for_the_users(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("version", "text"), [((18, 1, 8), ""), ((16, 0, 6), "is LLVM 16.0.6"), (None, "older than 16")]
 )
-def test_library_without_version_in_its_name_is_asked(
-    tmp_path: Path, version: tuple[int, ...] | None, text: str
-) -> None:
+def test_library_without_version_in_its_name_is_asked(tmp_path, version, text):
     source = "void LLVMContextCreate(void) {}\n"
     if version:  # LLVMGetVersion came with LLVM 16
         assignments = "".join(f"*{name} = {number};" for name, number in zip("abc", version, strict=True))
@@ -119,7 +117,7 @@ os.listdir = without(("karellen", "libLLVM"))
 """
 
 
-def test_without_llvm_the_scalar_variant_with_one_warning(run_python) -> None:
+def test_without_llvm_the_scalar_variant_with_one_warning(run_python):
     code = """
 import warnings, mrt_mitsuba.plugins
 from mrt_mitsuba import llvm, runtime
@@ -134,18 +132,20 @@ except mrt_mitsuba.VariantError as error:
 """
     first, loaded, refused = run_python(HIDE + code).stdout.splitlines()
     assert first.startswith("scalar_rgb scalar_rgb 1 rendering in the slow variant scalar_rgb: ")
-    assert "no usable LLVM 17" in first and loaded == "False"
+    assert "no usable LLVM 17" in first
+    assert loaded == "False"
     assert all("pip install karellen-llvm-core" in text for text in (first, refused))
 
 
-def test_old_library_named_by_the_user_is_refused_with_a_warning(run_python, tmp_path: Path) -> None:
+def test_old_library_named_by_the_user_is_refused_with_a_warning(run_python, tmp_path):
     old = library(tmp_path, "libLLVM-15.so.1")
     code = "import mrt_mitsuba, os; print(os.environ['DRJIT_LIBLLVM_PATH'])"
     done = run_python(code, DRJIT_LIBLLVM_PATH=old)
-    assert old not in done.stdout and f"{old}, named by {llvm.VARIABLE}, is LLVM 15" in done.stderr
+    assert old not in done.stdout
+    assert f"{old}, named by {llvm.VARIABLE}, is LLVM 15" in done.stderr
 
 
-def test_importing_drjit_too_early_warns(run_python) -> None:
+def test_importing_drjit_too_early_warns(run_python):
     code = """
 import drjit, mrt_mitsuba
 from mrt_mitsuba import runtime

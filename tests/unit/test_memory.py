@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from cases import Cases
 
 from mrt_mitsuba import machine, runtime
 from mrt_mitsuba.errors import UsageError
@@ -59,18 +60,18 @@ def show(root: Path, groups: str, files: dict[str, str]) -> None:
         (root / name).write_text(text)
 
 
-V1, V2 = ("memory.limit_in_bytes", "memory.usage_in_bytes"), ("memory.max", "memory.current")
+V1 = ("memory.limit_in_bytes", "memory.usage_in_bytes")
+V2 = ("memory.max", "memory.current")
 
 
-@pytest.mark.parametrize(
-    ("group", "base", "names", "place"),
-    [
-        ("0::/a/b", "", V2, "a/b"),
-        ("0::/a/b", "", V2, "a"),
-        ("4:memory:/a/b", "memory", V1, "a"),
-        ("7:cpu,memory:/elsewhere", "memory", V1, ""),
-    ],
-)
+limits = Cases()
+limits("0::/a/b", "", V2, "a/b")
+limits("0::/a/b", "", V2, "a")
+limits("4:memory:/a/b", "memory", V1, "a")
+limits("7:cpu,memory:/elsewhere", "memory", V1, "")
+
+
+@pytest.mark.parametrize(("group", "base", "names", "place"), limits)
 def test_limits_of_control_groups_count(tmp_path, group, base, names, place):
     """Limits as the system shows them: in the group itself, in one above, or in a container's only one."""
     files = {"memory.stat": f"anon 5\ninactive_file {GIB // 4}\n", names[1]: f"{GIB // 2}\n"}
@@ -94,33 +95,32 @@ def test_textures_are_taken_from_the_budget():
 ALL = len(os.sched_getaffinity(0))
 
 
-@pytest.mark.parametrize(
-    ("membership", "files", "cores"),
-    [
-        ("0::/", {}, ALL),
-        ("0::/", {"cpu.max": "max 100000"}, ALL),
-        ("0::/", {"cpu.max": "100000 100000"}, 1),
-        ("0::/", {"cpu.max": "50000 100000"}, 1),
-        ("0::/", {"cpu.max": "150000 100000"}, min(2, ALL)),
-        ("0::/", {"cpu.max": "99900000 100000"}, ALL),
-        # the group above this one grants less
-        ("0::/a/b", {"a/b/cpu.max": "400000 100000", "a/cpu.max": "100000 100000"}, 1),
-        # version 1 of the interface; and a path of the host's, which a container does not see
-        ("4:cpu,cpuacct:/x\n5:memory:/", {"cpu,cpuacct/x/cpu.cfs_quota_us": "100000"}, 1),
-        ("4:cpu,cpuacct:/docker/f00", {"cpu,cpuacct/cpu.cfs_quota_us": "100000"}, 1),
-        ("4:cpu,cpuacct:/x", {"cpu,cpuacct/x/cpu.cfs_quota_us": "-1"}, ALL),
-        ("5:memory:/x", {"memory/x/cpu.max": "100000 100000"}, ALL),
-        ("0::/", {"cpu.max": "nonsense"}, ALL),
-    ],
-)
-def test_quotas_of_control_groups(tmp_path: Path, membership: str, files: dict[str, str], cores: int) -> None:
+quotas = Cases()
+quotas("0::/", {}, ALL)
+quotas("0::/", {"cpu.max": "max 100000"}, ALL)
+quotas("0::/", {"cpu.max": "100000 100000"}, 1)
+quotas("0::/", {"cpu.max": "50000 100000"}, 1)
+quotas("0::/", {"cpu.max": "150000 100000"}, min(2, ALL))
+quotas("0::/", {"cpu.max": "99900000 100000"}, ALL)
+# the group above this one grants less
+quotas("0::/a/b", {"a/b/cpu.max": "400000 100000", "a/cpu.max": "100000 100000"}, 1)
+# version 1 of the interface; and a path of the host's, which a container does not see
+quotas("4:cpu,cpuacct:/x\n5:memory:/", {"cpu,cpuacct/x/cpu.cfs_quota_us": "100000"}, 1)
+quotas("4:cpu,cpuacct:/docker/f00", {"cpu,cpuacct/cpu.cfs_quota_us": "100000"}, 1)
+quotas("4:cpu,cpuacct:/x", {"cpu,cpuacct/x/cpu.cfs_quota_us": "-1"}, ALL)
+quotas("5:memory:/x", {"memory/x/cpu.max": "100000 100000"}, ALL)
+quotas("0::/", {"cpu.max": "nonsense"}, ALL)
+
+
+@pytest.mark.parametrize(("membership", "files", "cores"), quotas)
+def test_quotas_of_control_groups(tmp_path, membership, files, cores):
     periods = {name.replace("quota", "period"): "100000" for name in files if "quota" in name}
     show(tmp_path, membership, {f"sys/fs/cgroup/{name}": text for name, text in (periods | files).items()})
     assert usable_cores(tmp_path) == cores
 
 
 @pytest.mark.skipif(ALL < 2, reason="needs two cores")
-def test_affinity() -> None:
+def test_affinity():
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(before)})
     try:
@@ -129,14 +129,15 @@ def test_affinity() -> None:
         os.sched_setaffinity(0, before)
 
 
-def test_drjit_has_as_many_threads_as_cores_but_two(monkeypatch: pytest.MonkeyPatch, variant: str) -> None:
+def test_drjit_has_as_many_threads_as_cores_but_two(monkeypatch, variant):
     import drjit as dr
 
     before = dr.thread_count()
     monkeypatch.setattr(runtime, "usable_cores", lambda: 1)
     try:
         runtime.use("scalar_rgb")
-        assert runtime.use(variant) and dr.thread_count() == min(before, 2)
+        assert runtime.use(variant)
+        assert dr.thread_count() == min(before, 2)
     finally:
         monkeypatch.undo()  # before the variant is set back
         dr.set_thread_count(before)
@@ -156,6 +157,6 @@ print(mrt.render({"type": "scene", "lamp": lamp, "camera": camera}).image.mean()
 """
 
 
-def test_one_thread_is_enough_for_exr_files(run_python) -> None:
+def test_one_thread_is_enough_for_exr_files(run_python):
     """Mitsuba waited for another one for ever, in each worker of a sweep with as many workers as cores."""
     assert run_python(EXR).stdout.split() == ["1.0", "1"]

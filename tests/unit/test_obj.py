@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import Cases
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 import mrt_mitsuba as mrt
@@ -52,57 +54,60 @@ HALF = [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
 FAN = [[1, 1, 0], [0, 1, 0]], [[0, 1, 0], [0, 0, 0]], [[0, 0, 0], [1, 0, 0]]
 
 
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        *((WHOLE + f"f {face}\n", [HALF]) for face in ("1 2 3", "1/1 2/2 3/3", "1//1 2//1 3//1", "+1 2 3")),
-        *(
-            (f"{WHOLE}f 1/1/1 2/2/1 3/3/1\n".replace("\n", e), [HALF])
-            for e in ("\r\n", "\r", " \t\n", " #\n")
-        ),
-        (SQUARE + "f -4 -3 -2\nv 5 5 5\nf -5 -4 -1", [HALF, [[0, 0, 0], [1, 0, 0], [5, 5, 5]]]),
-        ("o a\ng b\nv 0 0 0 1\nv 1 0 0 1 2 3\nv 1 1 0 1 .1 2 3\nvt .5\nvt 0 0 0\nl 1 2\nf 1 2 3", [HALF]),
-        ("\ufeff" + SQUARE + "s off\nf 1 \\\n2 \\\n3\n", [HALF]),
-        (SQUARE + "f 1 2 3 4\n", [HALF, [[0, 0, 0], [1, 1, 0], [0, 1, 0]]]),
-        (SQUARE + "f 1 2 3 4 1 2\n", [HALF, *([[0, 0, 0], *ends] for ends in FAN)]),
-    ],
-)
-def test_geometry(model, text: str, found: list) -> None:
+geometry = Cases()
+for face in ("1 2 3", "1/1 2/2 3/3", "1//1 2//1 3//1", "+1 2 3"):
+    geometry(WHOLE + f"f {face}\n", [HALF])
+for e in ("\r\n", "\r", " \t\n", " #\n"):
+    geometry(f"{WHOLE}f 1/1/1 2/2/1 3/3/1\n".replace("\n", e), [HALF])
+geometry(SQUARE + "f -4 -3 -2\nv 5 5 5\nf -5 -4 -1", [HALF, [[0, 0, 0], [1, 0, 0], [5, 5, 5]]])
+geometry("o a\ng b\nv 0 0 0 1\nv 1 0 0 1 2 3\nv 1 1 0 1 .1 2 3\nvt .5\nvt 0 0 0\nl 1 2\nf 1 2 3", [HALF])
+geometry("\ufeff" + SQUARE + "s off\nf 1 \\\n2 \\\n3\n", [HALF])
+geometry(SQUARE + "f 1 2 3 4\n", [HALF, [[0, 0, 0], [1, 1, 0], [0, 1, 0]]])
+geometry(SQUARE + "f 1 2 3 4 1 2\n", [HALF, *([[0, 0, 0], *ends] for ends in FAN)])
+
+
+@pytest.mark.parametrize(("text", "found"), geometry)
+def test_geometry(model, text, found):
     (mesh,) = model(text)
-    np.testing.assert_array_equal(triangles(mesh), found)
+    assert_array_equal(triangles(mesh), found)
     assert mesh.material == DEFAULT_MATERIAL
-    assert mesh.faces.dtype == np.uint32 and mesh.vertices.dtype == np.float32
+    assert mesh.faces.dtype == np.uint32
+    assert mesh.vertices.dtype == np.float32
 
 
-def test_runs_of_lines_equal_single_lines(model) -> None:
+def test_runs_of_lines_equal_single_lines(model):
     """A comment keeps a line out of the fast path; more lines than it takes at once."""
     rng = np.random.default_rng(1)
-    points, faces = rng.integers(-999, 999, size=(4200, 3)) / 64, rng.integers(1, 4201, size=(4200, 3))
+    points = rng.integers(-999, 999, size=(4200, 3)) / 64
+    faces = rng.integers(1, 4201, size=(4200, 3))
     lines = [f"v {x:.9g} {y:.9e} {z}" for x, y, z in points] + [f"vt {x:g} {y:g}" for x, y, _ in points]
     lines += [f"f {a}/{b} {b}/{c} {c}/{a}" for a, b, c in faces]
     fast, slow = (model("".join(line + end for line in lines))[0] for end in ("\n", " #\n"))
-    np.testing.assert_array_equal(triangles(fast), triangles(slow))
-    np.testing.assert_array_equal(triangles(fast), points[faces - 1])
+    assert_array_equal(triangles(fast), triangles(slow))
+    assert_array_equal(triangles(fast), points[faces - 1])
 
 
-def test_a_mesh_for_each_material_with_its_own_vertices(model) -> None:
+def test_a_mesh_for_each_material_with_its_own_vertices(model):
     faces = "f 1 2 3\nusemtl red\nf 1 3 4\nusemtl painted\nf 2 3 4\nusemtl red\nf 2 3 4"
     text = "mtllib model.mtl\n" + SQUARE + faces
     default, red, other = model(text, MTL)
-    assert default.material == DEFAULT_MATERIAL and other.material.diffuse == (0.5,) * 3
+    assert default.material == DEFAULT_MATERIAL
+    assert other.material.diffuse == (0.5,) * 3
     assert [len(m.faces) for m in (default, red, other)] == [1, 2, 1]
     assert [len(m.vertices) for m in (default, red, other)] == [3, 4, 3]
-    np.testing.assert_array_equal(triangles(red)[0], [[0, 0, 0], [1, 1, 0], [0, 1, 0]])
+    assert_array_equal(triangles(red)[0], [[0, 0, 0], [1, 1, 0], [0, 1, 0]])
     found = red.material
     assert (found.ior, found.alpha) == (1.2, 0.25)  # from Ka and Ni
-    assert found.diffuse == (1.9, 0.1, 0.1) and found.specular == (0.2, 0.3, 0.4)
+    assert found.diffuse == (1.9, 0.1, 0.1)
+    assert found.specular == (0.2, 0.3, 0.4)
     found = model(text, MTL, convention="standard")[1].material
     assert (found.ior, found.alpha) == (0.25, pytest.approx(math.sqrt(2 / 100)))  # from Ni and Ns
-    assert default.material.ior == 1.1022 and other.material.ior == 1.1022
+    assert default.material.ior == 1.1022
+    assert other.material.ior == 1.1022
 
 
 @pytest.mark.parametrize("name", ["art\\a.png", "art/my a.png", "-s 2 2 -o 0 0 0 -clamp on a.png"])
-def test_names_of_files(model, tmp_path: Path, name: str) -> None:
+def test_names_of_files(model, tmp_path, name):
     file = tmp_path / name.split("on ")[-1].replace("\\", "/")
     file.parent.mkdir(exist_ok=True)
     file.write_bytes(b"")
@@ -111,36 +116,49 @@ def test_names_of_files(model, tmp_path: Path, name: str) -> None:
     assert Path(mesh.material.texture) == file
 
 
-def test_faces_without_coordinates_have_no_texture(model, tmp_path: Path) -> None:
+def test_a_texture_is_looked_for_next_to_the_model_before_the_library(model, tmp_path):
+    (tmp_path / "library").mkdir()
+    near = tmp_path / "picture.png"
+    far = tmp_path / "library" / "picture.png"
+    (tmp_path / "library" / "model.mtl").write_text(PAINTED)
+    text = USE_PAINTED.replace("model.mtl", "library/model.mtl")
+    far.write_bytes(b"")
+    assert model(text)[0].material.texture == str(far)
+    near.write_bytes(b"")
+    assert model(text)[0].material.texture == str(near)
+
+
+def test_faces_without_coordinates_have_no_texture(model, tmp_path):
     (tmp_path / "picture.png").write_bytes(b"")
     textured, plain = model(USE_PAINTED.replace("f 1/1 2/2 3/3", "f 1/4 2/3 3/2\nf 1 3 4"), PAINTED)
     assert textured.material.texture == str(tmp_path / "picture.png")
-    np.testing.assert_array_equal(textured.uvs[textured.faces[0]], [[0, 1], [1, 1], [1, 0]])
-    assert plain.material.texture is None and plain.uvs is None and plain.material.diffuse == (0.5,) * 3
+    assert_array_equal(textured.uvs[textured.faces[0]], [[0, 1], [1, 1], [1, 0]])
+    assert plain.material.texture is None
+    assert plain.uvs is None
+    assert plain.material.diffuse == (0.5,) * 3
 
 
 LOST = "mtllib nowhere.mtl\n" + SQUARE + "usemtl red\nf 1 2 3\n"
 DROPPED = "newmtl painted\nKd 0.5\nillum 2\nd 0.5\nd 1.0\nTf 1 1 1\nmap_bump x.png\n"
 
 
-@pytest.mark.parametrize(
-    ("obj", "mtl", "convention", "texts"),
-    [
-        (USE_PAINTED, PAINTED, "report", ["model.mtl:9: the texture picture.png is missing", "Kd is used"]),
-        (LOST, None, "report", ["model.obj:1: the material library nowhere.mtl is", "material 'red'"]),
-        (USE_PAINTED, DROPPED, "standard", ["model.mtl:4: d 0.5 is not used (and so do 1 more statements)"]),
-        (USE_PAINTED, DROPPED, "report", []),
-    ],
-)
-def test_what_is_missing_or_dropped_is_a_warning(
-    model, obj: str, mtl: str | None, convention: str, texts: list[str]
-) -> None:
+gaps = Cases()
+gaps(USE_PAINTED, PAINTED, "report", ["model.mtl:9: the texture picture.png is missing", "Kd is used"])
+gaps(LOST, None, "report", ["model.obj:1: the material library nowhere.mtl is", "material 'red'"])
+gaps(USE_PAINTED, DROPPED, "standard", ["model.mtl:4: d 0.5 is not used (and so do 1 more statements)"])
+gaps(USE_PAINTED, DROPPED, "report", [])
+
+
+@pytest.mark.parametrize(("obj", "mtl", "convention", "texts"), gaps)
+def test_what_is_missing_or_dropped_is_a_warning(model, obj, mtl, convention, texts):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         (mesh,) = model(obj, mtl, convention=convention)
     said = "\n".join(str(each.message) for each in caught)
-    assert all(text in said for text in texts) and bool(said) is bool(texts)
-    assert mesh.material.texture is None and (mesh.material.diffuse == (0.5,) * 3) is (mtl is not None)
+    assert all(text in said for text in texts)
+    assert bool(said) is bool(texts)
+    assert mesh.material.texture is None
+    assert (mesh.material.diffuse == (0.5,) * 3) is (mtl is not None)
 
 
 # What files are made of, whole and in pieces
@@ -159,7 +177,7 @@ MTL_PIECES = [*MTL_WORDS.split(), "\n", "\n"]
     start=st.sampled_from(["", SQUARE, "mtllib model.mtl\n" + WHOLE]),
     mtl=st.lists(st.sampled_from(MTL_PIECES), max_size=30).map(" ".join),
 )
-def test_any_text_is_read_or_refused(model, obj: bytes, start: str, mtl: str) -> None:
+def test_any_text_is_read_or_refused(model, obj, start, mtl):
     """Whatever the file: meshes that hold together, or one error of one line that names a file."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MrtWarning)
@@ -170,18 +188,22 @@ def test_any_text_is_read_or_refused(model, obj: bytes, start: str, mtl: str) ->
             return
     assert meshes
     for mesh in meshes:
-        assert np.isfinite(mesh.vertices).all() and mesh.faces.shape[1] == 3
-        assert len(mesh.faces) > 0 and mesh.faces.max() < len(mesh.vertices)
+        assert np.isfinite(mesh.vertices).all()
+        assert mesh.faces.shape[1] == 3
+        assert len(mesh.faces) > 0
+        assert mesh.faces.max() < len(mesh.vertices)
 
 
-def test_view_as_asked_for(tmp_path) -> None:
+def test_view_as_asked_for(tmp_path):
     (path := tmp_path / "a.obj").write_text(SQUARE + "f 1 2 3\n")
-    placed, r = obj_scene(path), math.sqrt(0.5)
+    placed = obj_scene(path)
+    r = math.sqrt(0.5)
     found = placed.camera.position, placed.lights[0].position
-    np.testing.assert_allclose(found, [(0.5 + r, 0.5 + 0.8 * r, 2.4 * r), (0.5 + 4 * r, 0.5 + 5 * r, 4 * r)])
+    assert_allclose(found, [(0.5 + r, 0.5 + 0.8 * r, 2.4 * r), (0.5 + 4 * r, 0.5 + 5 * r, 4 * r)])
     view = obj_scene(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
     assert view.camera == Camera((0, 0, 5), placed.camera.target, hfov=30)
-    assert [light.position for light in view.lights] == [(1, 2, 3)] and view.texturing == "standard"
+    assert [light.position for light in view.lights] == [(1, 2, 3)]
+    assert view.texturing == "standard"
 
 
 def test_standard_textures_stand_upright_and_the_reports_upside_down(tmp_path):
@@ -196,7 +218,8 @@ def test_standard_textures_stand_upright_and_the_reports_upside_down(tmp_path):
     for convention, above in (("standard", 0), ("report", 2)):
         options = {"convention": convention, "width": 8, "height": 8, "aa": 1, "aamode": "none"}
         image = mrt.render(tmp_path / "quad.obj", **view, **options).image
-        assert image[2, 1].argmax() == above and image[5, 1].argmax() == 2 - above
+        assert image[2, 1].argmax() == above
+        assert image[5, 1].argmax() == 2 - above
         assert (image[:, 4:] == image[0, 7]).all()
 
 
@@ -205,4 +228,4 @@ def test_the_standard_uses_normals_and_the_report_does_not(model):
     text = SQUARE + "vn 0 0 1\nvn 0 1 0\nf 1//1 2//1 3//2\n"
     assert model(text, convention="report")[0].normals is None
     (mesh,) = model(text, convention="standard")
-    np.testing.assert_array_equal(mesh.normals[mesh.faces[0]], [[0, 0, 1], [0, 0, 1], [0, 1, 0]])
+    assert_array_equal(mesh.normals[mesh.faces[0]], [[0, 0, 1], [0, 0, 1], [0, 1, 0]])

@@ -7,6 +7,7 @@ import math
 import re
 
 import pytest
+from cases import Cases
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,32 +16,33 @@ from mrt_mitsuba.command.options import Options, parse
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output import LAYERS
 from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.target import Target
 
-
-@pytest.mark.parametrize(
-    ("arguments", "values"),
-    [
-        ("o 3", {"scene": 3}),
-        ("o 9 width=1 height=65536", {"scene": 9, "width": 1, "height": 65536}),
-        ("o 1 focaldist=2 focalrange=.5", {"scene": 1, "focaldist": 2.0, "focalrange": 0.5}),
-        ("o fresnel=dielectric variant=scalar_rgb", {"fresnel": "dielectric", "variant": "scalar_rgb"}),
-        ("o layers=all aamode=none", {"layers": tuple(LAYERS), "aamode": "none"}),
-        ("o motion=0.1,-2,3e-1 motionsamples=4", {"motion": (0.1, -2.0, 0.3), "motionsamples": 4}),
-        ("o memory=4G", {"memory": 4 * 2**30}),
-        ("o memory=1.5gib", {"memory": 3 * 2**29}),
-        ("o scene=a=b.xml", {"scene": "a=b.xml"}),
-        (
-            "o scene=a.OBJ camera=1,2,3 target=0,0,.5 up=0,0,1 fov=45 light=0,9,0",
-            {"scene": "a.OBJ", "camera": (1, 2, 3), "target": (0, 0, 0.5), "up": (0, 0, 1)}
-            | {"fov": 45.0, "light": (0, 9, 0)},
-        ),
-        ("o quiet=1 plan=show", {"quiet": True, "plan": "show"}),
-        ("o quiet=no", {"quiet": False}),
-        ("dir.v1/o.v2", {"filename": "dir.v1/o.v2"}),
-        ("a=b", {"filename": "a=b"}),
-    ],
+accepted = Cases()
+accepted("o 3", {"scene": 3})
+accepted("o 9 width=1 height=65536", {"scene": 9, "width": 1, "height": 65536})
+accepted("o 1 focaldist=2 focalrange=.5", {"scene": 1, "focaldist": 2.0, "focalrange": 0.5})
+accepted("o fresnel=dielectric variant=scalar_rgb", {"fresnel": "dielectric", "variant": "scalar_rgb"})
+accepted("o layers=all aamode=none", {"layers": tuple(LAYERS), "aamode": "none"})
+accepted("o motion=0.1,-2,3e-1 motionsamples=4", {"motion": (0.1, -2.0, 0.3), "motionsamples": 4})
+accepted("o memory=4G", {"memory": 4 * 2**30})
+accepted("o memory=1.5gib", {"memory": 3 * 2**29})
+accepted("o scene=a=b.xml", {"scene": "a=b.xml"})
+accepted(
+    "o scene=a.OBJ camera=1,2,3 target=0,0,.5 up=0,0,1 fov=45 light=0,9,0",
+    {"scene": "a.OBJ", "camera": (1, 2, 3), "target": (0, 0, 0.5), "up": (0, 0, 1)}
+    | {"fov": 45.0, "light": (0, 9, 0)},
 )
-def test_accepted(arguments: str, values: dict[str, object]) -> None:
+accepted("o target=0.5", {"target": Target(0.5)})
+accepted("o target=2%", {"target": Target(0.02, relative=True)})
+accepted("o quiet=1 plan=show", {"quiet": True, "plan": "show"})
+accepted("o quiet=no", {"quiet": False})
+accepted("dir.v1/o.v2", {"filename": "dir.v1/o.v2"})
+accepted("a=b", {"filename": "a=b"})
+
+
+@pytest.mark.parametrize(("arguments", "values"), accepted)
+def test_accepted(arguments, values):
     parsed = parse(arguments.split())
     assert {name: getattr(parsed, name) for name in values} == values
     others = {"filename", *values}
@@ -49,52 +51,51 @@ def test_accepted(arguments: str, values: dict[str, object]) -> None:
             assert getattr(parsed, field.name) == field.default
 
 
-BAD = [
-    # argument(s), what the message must hold
-    ("width=1e3", "width=1e3: must be a whole number"),
-    ("width=" + "9" * 5000, "whole number"),
-    ("width=\u0663", "whole number"),
-    ("aa=0", "must be a whole number from 1 to 64"),
-    ("aamode=sobal", "aamode=sobal: must be none, luma"),
-    ("focaldist=nan", "must be a finite number, 0 or more"),
-    ("focaldist=-1", "0 or more"),
-    (["out", "variant=llvm ad"], "must be a name such as llvm_ad_rgb"),
-    ("layers=depth,depth", "each once"),
-    ("layers=depht", "a comma list out of depth, normal"),
-    ("tonemap=gamma", "report or srgb"),
-    ("motion=1,2,nan", "three finite numbers"),
-    ("memory=4X", "bytes with an optional unit"),
-    ("memory=1M", "at least 64M"),
-    ("memory=infG", "bytes with"),
-    ("seed=-1", "from 0 to 4294967295"),
-    ("scene=", "path of a file"),
-    ("quiet=2", "must be 1 or 0"),
-    ("widht=3", "unknown option 'widht'. Did you mean width?"),
-    ("--width=3", "Did you mean width?"),
-    ("zzz=3", "unknown option 'zzz'. 'mrt help' lists the options."),
-    ("filename=x", "unknown option 'filename'"),
-    ("width=3 width=4", "width is given twice"),
-    ("1 2", "unexpected argument '2'"),
-    ("1 scene=a.xml", "both SCENE 1 and scene=a.xml"),
-    ("motionsamples=4", "only with motion"),
-    ("motion=1,0,0 motionmode=both", "frames or stratified"),
-    ("camera=1,2,3", "camera is of use only with an OBJ file: scene=PATH.obj"),
-    ("scene=a.xml texturing=standard", "texturing is of use only with an OBJ file"),
-    ("scene=a.obj target=nan,0,0", "must be a positive number, or three"),
-    ("scene=a.obj fov=0", "must be degrees, more than 0 and less than 180"),
-    ("scene=a.obj up=0,0,0", "up must have a length"),
-    ("scene=a.obj camera=1,2,3 target=1,2,3", "camera and target are the same point"),
-    ("three", "('mrt scenes' lists them); a file is scene=PATH"),
-    (["width=3"], "FILENAME is missing before width=3"),
-    (["out.png"], "FILENAME has no extension: write out format=png"),
-    (["--fast"], "unknown option --fast"),
-    (["folder/"], "names no file"),
-    (["a\0b"], "names no file"),
-]
+refused = Cases()
+# arguments, and what the message must hold
+refused("width=1e3", "width=1e3: must be a whole number")
+refused("width=" + "9" * 5000, "whole number")
+refused("width=\u0663", "whole number")
+refused("aa=0", "must be a whole number from 1 to 64")
+refused("aamode=sobal", "aamode=sobal: must be none, luma")
+refused("focaldist=nan", "must be a finite number, 0 or more")
+refused("focaldist=-1", "0 or more")
+refused(["out", "variant=llvm ad"], "must be a name such as llvm_ad_rgb")
+refused("layers=depth,depth", "each once")
+refused("layers=depht", "a comma list out of depth, normal")
+refused("tonemap=gamma", "report or srgb")
+refused("motion=1,2,nan", "three finite numbers")
+refused("memory=4X", "bytes with an optional unit")
+refused("memory=1M", "at least 64M")
+refused("memory=infG", "bytes with")
+refused("seed=-1", "from 0 to 4294967295")
+refused("scene=", "path of a file")
+refused("quiet=2", "must be 1 or 0")
+refused("widht=3", "unknown option 'widht'. Did you mean width?")
+refused("--width=3", "Did you mean width?")
+refused("zzz=3", "unknown option 'zzz'. 'mrt help' lists the options.")
+refused("filename=x", "unknown option 'filename'")
+refused("width=3 width=4", "width is given twice")
+refused("1 2", "unexpected argument '2'")
+refused("1 scene=a.xml", "both SCENE 1 and scene=a.xml")
+refused("motionsamples=4", "only with motion")
+refused("motion=1,0,0 motionmode=both", "frames or stratified")
+refused("camera=1,2,3", "camera is of use only with an OBJ file: scene=PATH.obj")
+refused("scene=a.xml texturing=standard", "texturing is of use only with an OBJ file")
+refused("scene=a.obj target=nan,0,0", "must be a positive number, or three")
+refused("scene=a.obj fov=0", "must be degrees, more than 0 and less than 180")
+refused("scene=a.obj up=0,0,0", "up must have a length")
+refused("scene=a.obj camera=1,2,3 target=1,2,3", "camera and target are the same point")
+refused("three", "('mrt scenes' lists them); a file is scene=PATH")
+refused(["width=3"], "FILENAME is missing before width=3")
+refused(["out.png"], "FILENAME has no extension: write out format=png")
+refused(["--fast"], "unknown option --fast")
+refused(["folder/"], "names no file")
+refused(["a\0b"], "names no file")
 
 
-@pytest.mark.parametrize(("arguments", "text"), BAD)
-def test_refused(arguments: str | list[str], text: str) -> None:
+@pytest.mark.parametrize(("arguments", "text"), refused)
+def test_refused(arguments, text):
     words = ["out", *arguments.split()] if isinstance(arguments, str) else arguments
     with pytest.raises(UsageError, match=re.escape(text)) as caught:
         parse(words)
@@ -103,7 +104,7 @@ def test_refused(arguments: str | list[str], text: str) -> None:
 
 @pytest.mark.fuzz
 @given(st.sampled_from(sorted(options.TABLE)), st.text(max_size=20))
-def test_any_text_is_taken_or_refused_in_one_line(name: str, text: str) -> None:
+def test_any_text_is_taken_or_refused_in_one_line(name, text):
     """Whatever is typed, the answer is a value that the table's own check accepts, or a UsageError."""
     extra = ["motion=1,0,0"] if name.startswith("motion") and name != "motion" else []
     extra += ["scene=a.obj"] if name in ("texturing", "camera", "target", "up", "fov", "light") else []
@@ -115,24 +116,31 @@ def test_any_text_is_taken_or_refused_in_one_line(name: str, text: str) -> None:
         assert getattr(Options(filename="o", **{name: value}), name) == value
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "taken"),
-    [
-        ("focaldist", 2, 2.0),
-        ("focaldist", None, None),
-        ("layers", ["depth"], ("depth",)),
-        ("layers", "depth,normal", ("depth", "normal")),
-        ("motion", [1, 2, 3], (1.0, 2.0, 3.0)),
-        ("memory", "4G", 2**32),
-        *(("width", value, UsageError) for value in (640.0, True, "640")),
-        *(("focaldist", value, UsageError) for value in (math.nan, "2")),
-        *(("motion", value, UsageError) for value in (3, (1, 2))),
-        ("aamode", 3, UsageError),
-        ("layers", [1], UsageError),
-        ("seed", -1, UsageError),
-    ],
-)
-def test_values_from_python(name: str, value: object, taken: object) -> None:
+given_in_python = Cases()
+given_in_python("focaldist", 2, 2.0)
+given_in_python("focaldist", None, None)
+given_in_python("layers", ["depth"], ("depth",))
+given_in_python("layers", "depth,normal", ("depth", "normal"))
+given_in_python("motion", [1, 2, 3], (1.0, 2.0, 3.0))
+given_in_python("memory", "4G", 2**32)
+for value in (640.0, True, "640"):
+    given_in_python("width", value, UsageError)
+for value in (math.nan, "2"):
+    given_in_python("focaldist", value, UsageError)
+for value in (3, (1, 2)):
+    given_in_python("motion", value, UsageError)
+given_in_python("aamode", 3, UsageError)
+given_in_python("layers", [1], UsageError)
+given_in_python("seed", -1, UsageError)
+given_in_python("target", 0.25, Target(0.25))
+given_in_python("target", "2.5%", Target(0.025, relative=True))
+given_in_python("target", Target(0.1), Target(0.1))
+for value in ("x%", "-1%", "0%", "nan%", "%", " 2%", 0, math.inf, True):
+    given_in_python("target", value, UsageError)
+
+
+@pytest.mark.parametrize(("name", "value", "taken"), given_in_python)
+def test_values_from_python(name, value, taken):
     if taken is not UsageError:
         assert getattr(RenderSettings(**{name: value}), name) == taken
         return
@@ -141,10 +149,11 @@ def test_values_from_python(name: str, value: object, taken: object) -> None:
     assert isinstance(caught.value, ValueError)
 
 
-def test_usage_names_every_option_with_its_default() -> None:
+def test_usage_names_every_option_with_its_default():
     text = tools.usage()
     assert max(map(len, text.splitlines())) <= tools.WIDTH
     entries = re.split(r"\n  (?=\w+=)", text.partition("\n\ncommands:")[0])[1:]
     assert [entry.partition("=")[0] for entry in entries] == list(options.TABLE)
     assert all(re.search(r"\(default:\s+[^)]+\)$", entry) for entry in entries)
-    assert "(default: 800)" in text and "(default: from the scene)" in text
+    assert "(default: 800)" in text
+    assert "(default: from the scene)" in text

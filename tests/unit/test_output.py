@@ -7,17 +7,20 @@ import os
 import pickle
 import resource
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from cases import Cases
 from nodes import TRIANGLE
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import interrupts
-from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
 from mrt_mitsuba.output import files as output
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.settings import RenderSettings
@@ -37,47 +40,50 @@ def grey(*values: float) -> np.ndarray:
     return np.repeat(np.array(values, np.float32)[None, :, None], 3, axis=2)
 
 
-@pytest.mark.parametrize(
-    ("tonemap", "values", "expected"),
-    [
-        ("report", [-np.inf, -1, 0, 0.999 / 255, 1.001 / 255, 0.5, 254.9 / 255, 1, 7, np.inf],
-         [0, 0, 0, 0, 1, 127, 254, 255, 255, 255]),
-        # 0.0031308: where the two pieces of the curve meet; 0.2140: the linear value of 127.49 / 255
-        ("srgb", [-1, 0, 0.0031308, 0.18, 0.2140, 0.5, 1, 3], [0, 0, 10, 118, 127, 188, 255, 255]),
-        ("srgb", np.where(LEVEL <= 0.04045, LEVEL / 12.92, ((LEVEL + 0.055) / 1.055) ** 2.4), range(256)),
-    ],
-)  # fmt: skip
-def test_levels(tonemap: str, values: Any, expected: Any) -> None:
-    np.testing.assert_array_equal(output.to_8bit(grey(*values), tonemap)[0, :, 0], expected)
+levels = Cases()
+levels(
+    "report",
+    [-np.inf, -1, 0, 0.999 / 255, 1.001 / 255, 0.5, 254.9 / 255, 1, 7, np.inf],
+    [0, 0, 0, 0, 1, 127, 254, 255, 255, 255],
+)
+# 0.0031308: where the two pieces of the curve meet; 0.2140: the linear value of 127.49 / 255
+levels("srgb", [-1, 0, 0.0031308, 0.18, 0.2140, 0.5, 1, 3], [0, 0, 10, 118, 127, 188, 255, 255])
+levels("srgb", np.where(LEVEL <= 0.04045, LEVEL / 12.92, ((LEVEL + 0.055) / 1.055) ** 2.4), range(256))
 
 
-def test_nan_is_black_with_a_warning() -> None:
+@pytest.mark.parametrize(("tonemap", "values", "expected"), levels)
+def test_levels(tonemap, values, expected):
+    assert_array_equal(output.to_8bit(grey(*values), tonemap)[0, :, 0], expected)
+
+
+def test_nan_is_black_with_a_warning():
     with pytest.warns(MrtWarning, match="1 pixels are NaN"):
-        np.testing.assert_array_equal(output.to_8bit(grey(0.5, np.nan), "report")[0, :, 0], [127, 0])
+        assert_array_equal(output.to_8bit(grey(0.5, np.nan), "report")[0, :, 0], [127, 0])
 
 
-def test_rows_beyond_the_first_block(tmp_path: Path) -> None:
+def test_rows_beyond_the_first_block(tmp_path):
     ramp = np.linspace(0, 1, 600, dtype=np.float32)[:, None, None].repeat(3, axis=2)
     output.write_png(tmp_path / "a.png", ramp)
     with Image.open(tmp_path / "a.png") as png:
-        assert png.mode == "RGB" and png.size == (1, 600)
-        np.testing.assert_array_equal(np.asarray(png)[:, 0, 0], np.trunc(255 * ramp[:, 0, 0]))
+        assert png.mode == "RGB"
+        assert png.size == (1, 600)
+        assert_array_equal(np.asarray(png)[:, 0, 0], np.trunc(255 * ramp[:, 0, 0]))
 
 
-def test_exr_holds_every_bit(tmp_path: Path, image: np.ndarray) -> None:
+def test_exr_holds_every_bit(tmp_path, image):
     image[0, 0] = np.nan, np.inf, -np.inf
     layers = {"depth.Z": image[:, :, 0], "normal": image, "albedo": image * 2, "samples": image[:, :, 1]}
     header = {"mrt:alpha": 1.5, "mrt:options": {"aa": 4, "layers": ["depth"]}}
     output.write_exr(tmp_path / "a.exr", image, layers, header)
     back = output.read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(back.image, image)
+    assert_array_equal(back.image, image)
     assert back.image.dtype == np.float32
     expected = {"depth.Z": image[:, :, 0], "samples.Y": image[:, :, 1]}
     expected |= {f"normal.{name}": image[:, :, i] for i, name in enumerate("XYZ")}
     expected |= {f"albedo.{name}": 2 * image[:, :, i] for i, name in enumerate("RGB")}
     assert back.layers.keys() == expected.keys()
     for name, values in expected.items():
-        np.testing.assert_array_equal(back.layers[name], values, err_msg=name)
+        assert_array_equal(back.layers[name], values, err_msg=name)
     assert back.header["mrt:options"] == '{"aa": 4, "layers": ["depth"]}'
     assert back.header["mrt:alpha"] == 1.5
 
@@ -85,7 +91,7 @@ def test_exr_holds_every_bit(tmp_path: Path, image: np.ndarray) -> None:
 @pytest.mark.parametrize(
     "layer", [{"depth": (7, 6)}, {"normal": (7, 5, 2)}, {"depth": (7, 5, 3)}, {"x": (7,)}]
 )
-def test_layer_of_another_shape(tmp_path: Path, image: np.ndarray, layer: dict) -> None:
+def test_layer_of_another_shape(tmp_path, image, layer):
     layers = {name: np.zeros(shape, np.float32) for name, shape in layer.items()}
     with pytest.raises(OutputError, match=f"layer {next(iter(layer))}"):
         output.write_exr(tmp_path / "a.exr", image, layers)
@@ -93,13 +99,13 @@ def test_layer_of_another_shape(tmp_path: Path, image: np.ndarray, layer: dict) 
 
 
 @pytest.mark.parametrize("content", [b"", b"not an EXR", b"\x76\x2f\x31\x01" + bytes(50)])
-def test_reading_what_is_no_exr(tmp_path: Path, content: bytes) -> None:
+def test_reading_what_is_no_exr(tmp_path, content):
     (tmp_path / "a.exr").write_bytes(content)
     with pytest.raises(OutputError, match=r"cannot read .*a\.exr"):
         output.read_exr(tmp_path / "a.exr")
 
 
-def test_channels_of_different_sizes_are_refused(tmp_path: Path) -> None:
+def test_channels_of_different_sizes_are_refused(tmp_path):
     import OpenEXR
 
     header = OpenEXR.Header(4, 2)
@@ -112,20 +118,20 @@ def test_channels_of_different_sizes_are_refused(tmp_path: Path) -> None:
         output.read_exr(tmp_path / "a.exr")
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("a.png", "is read-only"),
-        ("/dev/full", "not a regular file"),
-        ("a" * 300 + ".png", "name too long"),
-        ("a\0.png", "names no file"),
-        ("..", "names no file"),
-    ],
-)
-def test_target_that_cannot_be_written(tmp_path: Path, image: np.ndarray, name: str, reason: str) -> None:
+targets = Cases()
+targets("a.png", "is read-only")
+targets("/dev/full", "not a regular file")
+targets("a" * 300 + ".png", "name too long")
+targets("a\0.png", "names no file")
+targets("..", "names no file")
+
+
+@pytest.mark.parametrize(("name", "reason"), targets)
+def test_target_that_cannot_be_written(tmp_path, image, name, reason):
     """What else is refused: ``tests/system/test_refusals.py``."""
     (tmp_path / "a.png").touch(0o444)
-    before, path = sorted(tmp_path.rglob("*")), tmp_path / name
+    before = sorted(tmp_path.rglob("*"))
+    path = tmp_path / name
     for attempt in (check_target, lambda p: output.write_png(p, image), lambda p: output.write_exr(p, image)):
         with pytest.raises(OutputError, match=f"(?i)cannot write .*{reason}"):
             attempt(path)
@@ -133,7 +139,7 @@ def test_target_that_cannot_be_written(tmp_path: Path, image: np.ndarray, name: 
 
 
 @pytest.mark.parametrize("name", ["a", "a.jpg", "a.b/c"])
-def test_extension_says_the_format(tmp_path: Path, image: np.ndarray, name: str) -> None:
+def test_extension_says_the_format(tmp_path, image, name):
     with pytest.raises(OutputError, match=r"must end in \.png or \.exr"):
         output.save(tmp_path / name, image)
 
@@ -149,7 +155,7 @@ def old(folder: Path, endings: list[str]) -> list[Path]:
     ("endings", "room"),
     [(["exr"], 0), (["exr"], 2000), (["png", "exr"], 6000)],  # the last is enough for one
 )
-def test_full_disk_leaves_the_old_files(tmp_path: Path, endings: list[str], room: int) -> None:
+def test_full_disk_leaves_the_old_files(tmp_path, endings, room):
     paths = old(tmp_path, endings)
     noise = np.random.default_rng(0).random((40, 40, 3), np.float32)  # does not compress
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -163,11 +169,18 @@ def test_full_disk_leaves_the_old_files(tmp_path: Path, endings: list[str], room
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
+@pytest.fixture
+def heeded() -> Iterator[None]:
+    """A shell ignores Ctrl-C for what it runs in the background, and so would the test."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("step", ["fsync", "fchmod", "replace"])
-def test_interrupt_leaves_all_files_old_or_makes_all_new(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, image: np.ndarray, step: str
-) -> None:
-    paths, before = old(tmp_path, ["png", "exr"]), getattr(os, step)
+def test_interrupt_leaves_all_files_old_or_makes_all_new(tmp_path, monkeypatch, heeded, image, step):
+    paths = old(tmp_path, ["png", "exr"])
+    before = getattr(os, step)
 
     def interrupted(*words: object) -> object:
         done = before(*words)
@@ -183,7 +196,7 @@ def test_interrupt_leaves_all_files_old_or_makes_all_new(
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
-def test_leftovers_of_killed_processes_are_removed(tmp_path: Path, image: np.ndarray) -> None:
+def test_leftovers_of_killed_processes_are_removed(tmp_path, image):
     names = (16 * "0", 16 * "1", 16 * "2", "a-file-of-the-user")
     left, alive, recent, own = (tmp_path / f".mrt-{name}.tmp" for name in names)
     with alive.open("wb") as file:
@@ -195,14 +208,15 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path: Path, image: np.nda
     assert sorted(tmp_path.iterdir()) == [alive, recent, own, tmp_path / "a.png"]
 
 
-def test_link_stays_and_its_target_is_replaced(tmp_path: Path, image: np.ndarray) -> None:
+def test_link_stays_and_its_target_is_replaced(tmp_path, image):
     target = tmp_path / "b.png"
     (tmp_path / "a.png").symlink_to(target)
     output.write_png(tmp_path / "a.png", image)
-    assert (tmp_path / "a.png").is_symlink() and target.stat().st_size > 0
+    assert (tmp_path / "a.png").is_symlink()
+    assert target.stat().st_size > 0
 
 
-def test_permissions_follow_the_umask_and_the_old_file(tmp_path: Path, image: np.ndarray) -> None:
+def test_permissions_follow_the_umask_and_the_old_file(tmp_path, image):
     path = tmp_path / "a.png"
     old = os.umask(0o027)
     try:
@@ -217,7 +231,7 @@ def test_permissions_follow_the_umask_and_the_old_file(tmp_path: Path, image: np
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
-def test_a_forked_process_can_write_too(tmp_path: Path, image: np.ndarray) -> None:
+def test_a_forked_process_can_write_too(tmp_path, image):
     """The threads that compress are not there in the child: it must not wait for them."""
     output.write_exr(tmp_path / "a.exr", image)
     child = os.fork()
@@ -229,9 +243,10 @@ def test_a_forked_process_can_write_too(tmp_path: Path, image: np.ndarray) -> No
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
-def test_no_file_is_replaced_that_the_scene_was_read_from(tmp_path: Path) -> None:
+def test_no_file_is_replaced_that_the_scene_was_read_from(tmp_path):
     """By its own name, one through another folder, or a hard link; through others: ``test_refusals.py``."""
-    texture, model = tmp_path / "texture.png", tmp_path / "a.obj"
+    texture = tmp_path / "texture.png"
+    model = tmp_path / "a.obj"
     output.save(texture, grey(0, 1))
     (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd texture.png\n")
     model.write_text("mtllib a.mtl\n" + TRIANGLE)
@@ -242,7 +257,8 @@ def test_no_file_is_replaced_that_the_scene_was_read_from(tmp_path: Path) -> Non
     for name in ("texture.png", f"../{tmp_path.name}/texture.png", "b.exr", "c.png"):
         with pytest.raises(OutputError, match="made from this file; choose another name"):
             result.save(tmp_path / "new.exr", tmp_path / name)
-    assert {path: path.read_bytes() for path in before} == before and not (tmp_path / "new.exr").exists()
+    assert {path: path.read_bytes() for path in before} == before
+    assert not (tmp_path / "new.exr").exists()
 
 
 LEAVE = "import os, shutil, sys; shutil.rmtree(os.getcwd())\n"
@@ -257,10 +273,11 @@ LEAVE = "import os, shutil, sys; shutil.rmtree(os.getcwd())\n"
     ],
     ids=["render", "mrt", "mrt-validate"],
 )
-def test_a_deleted_working_folder_is_named(run_python, way: str, words: str) -> None:
+def test_a_deleted_working_folder_is_named(run_python, way, words):
     """Mitsuba itself ends in an ImportError there, and then by a signal."""
     said = run_python(LEAVE + way, *words.split(), code=1).stderr
-    assert "the working folder has been deleted" in said and said.count("\n") == 1
+    assert "the working folder has been deleted" in said
+    assert said.count("\n") == 1
 
 
 SENSORS = {
@@ -273,7 +290,7 @@ SENSORS = {
 
 @pytest.mark.parametrize("crop", [{}, {"crop_width": 10, "crop_height": 8, "crop_offset_x": 3}])
 @pytest.mark.parametrize("name", SENSORS)
-def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant: str, name: str, crop: dict) -> None:
+def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant, name, crop):
     """A point on the ray through a place of the picture comes back to this place, and the camera sees it."""
     import mitsuba as mi
 
@@ -286,11 +303,11 @@ def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant: str, name
         ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(place), mi.Point2f(0.5))
         point = np.append(np.array(ray(7.0)).ravel(), 1.0)
         x, y, _, w = point @ header["mrt:worldToNDC"]
-        np.testing.assert_allclose((x / w, y / w), place, atol=1e-5)  # float32
+        assert_allclose((x / w, y / w), place, atol=1e-5)  # float32
         assert (point @ header["mrt:worldToCamera"])[2] < 0
 
 
-def test_what_a_user_keeps_can_be_pickled() -> None:
+def test_what_a_user_keeps_can_be_pickled():
     """Results, with plan and error, settings, scenes, comparisons, checks, edges, and errors."""
     size: dict[str, Any] = {"width": 16, "height": 12}
     result = mrt.render(3, integrator="path", spp=16, aamode="noise", layers=["depth"], **size)
@@ -300,10 +317,11 @@ def test_what_a_user_keeps_can_be_pickled() -> None:
         again = pickle.loads(pickle.dumps(each))
         assert str(again) == str(each) or again == each
     again = pickle.loads(pickle.dumps(result))
-    assert again.image.tobytes() == result.image.tobytes() and again.header() == result.header()
+    assert again.image.tobytes() == result.image.tobytes()
+    assert again.header() == result.header()
 
 
-def test_only_large_pictures_are_compressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_large_pictures_are_compressed(tmp_path, monkeypatch):
     """To the same pixels: compression takes longer than all other writing."""
     import OpenEXR
 
@@ -315,4 +333,18 @@ def test_only_large_pictures_are_compressed(tmp_path: Path, monkeypatch: pytest.
     assert sizes[0] > image.nbytes > 2 * sizes[1]
     assert OpenEXR.File(str(tmp_path / "large.exr")).header()["compression"] == OpenEXR.ZIP_COMPRESSION
     for name in ("small.exr", "large.exr"):
-        np.testing.assert_array_equal(output.read_exr(tmp_path / name).image, image)
+        assert_array_equal(output.read_exr(tmp_path / name).image, image)
+
+
+@pytest.mark.parametrize("names", [(), (None,), (3,), (b"a.exr",), (["a.exr"],)])
+def test_saving_without_a_name_says_so(tmp_path, monkeypatch, names):
+    monkeypatch.chdir(tmp_path)
+    result = mrt.render(0, width=4, height=3, aa=1, aamode="none")
+    with pytest.raises(UsageError, match="name of a file"):
+        result.save(*names)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_tonemap_is_refused_in_every_format(tmp_path, image):
+    with pytest.raises(UsageError, match="tonemap='hdr': must be report or srgb"):
+        output.save(tmp_path / "a.exr", image, tonemap="hdr")

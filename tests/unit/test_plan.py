@@ -8,6 +8,7 @@ from typing import Any
 
 import drjit as dr
 import pytest
+from cases import Cases
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.rendering.progress import Progress
@@ -23,15 +24,11 @@ BALL = {"type": "sphere", "center": [0, 0, -4], "bsdf": MATTE}
 def scene(**nodes: Any) -> dict[str, Any]:
     """Two balls under a lamp and the sky, with nodes put in."""
     film = {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}}
-    return {
-        "type": "scene",
-        "integrator": {"type": "mrt_whitted"},
-        "sensor": {"type": "perspective", "film": film},
-        "sky": {"type": "constant", "radiance": 0.3},
-        "light": LIGHT,
-        "ball": BALL,
-        "second": {**BALL, "center": [2, 0, -5]},  # a lookup among one needs no code
-    } | nodes
+    common = {"type": "scene", "integrator": {"type": "mrt_whitted"}, "light": LIGHT, "ball": BALL}
+    common["sensor"] = {"type": "perspective", "film": film}
+    common["sky"] = {"type": "constant", "radiance": 0.3}
+    common["second"] = {**BALL, "center": [2, 0, -5]}  # a lookup among one needs no code
+    return common | nodes
 
 
 class Watch(Progress):
@@ -57,54 +54,54 @@ def base() -> tuple[mrt.Result, str]:
     return planned(scene())
 
 
-@pytest.mark.parametrize(
-    ("nodes", "options"),
-    [
-        ({"ball": {**BALL, "radius": 0.5}, "light": {**LIGHT, "intensity": 3.0}}, {}),
-        ({"third": {**BALL, "center": [4, 0, -5], "bsdf": {**MATTE, "alpha": 0.3}}}, {}),
-        ({"sky": {"type": "constant", "radiance": 0.9}}, {"seed": 3}),
-        ({}, {"focaldist": 0.0}),
-        ({}, {"region": (2, 2, 8, 6)}),
-        ({}, {"spp": 2}),
-    ],
-)
-def test_what_no_decision_depends_on_leaves_the_kernel(
-    nodes: dict[str, Any], options: dict[str, Any], base: tuple[mrt.Result, str]
-) -> None:
+alike = Cases()
+alike({"ball": {**BALL, "radius": 0.5}, "light": {**LIGHT, "intensity": 3.0}}, {})
+alike({"third": {**BALL, "center": [4, 0, -5], "bsdf": {**MATTE, "alpha": 0.3}}}, {})
+alike({"sky": {"type": "constant", "radiance": 0.9}}, {"seed": 3})
+alike({}, {"focaldist": 0.0})
+alike({}, {"region": (2, 2, 8, 6)})
+alike({}, {"spp": 2})
+
+
+@pytest.mark.parametrize(("nodes", "options"), alike)
+def test_what_no_decision_depends_on_leaves_the_kernel(nodes, options, base):
     """Numbers are data: places, colours, how many spheres."""
     result, kernel = planned(scene(**nodes), **options)
     assert result.plan.kernel == base[0].plan.kernel
     assert kernel == base[1]
 
 
-def test_what_the_integrator_does_not_say_is_not_made_up() -> None:
+def test_what_the_integrator_does_not_say_is_not_made_up():
     plan = planned(scene(), integrator="direct")[0].plan
-    assert plan.kernel is None and not any("shadow" in what for what, _ in plan.left_out)
+    assert plan.kernel is None
+    assert not any("shadow" in what for what, _ in plan.left_out)
 
 
-@pytest.mark.parametrize(
-    ("options", "passes"),
-    [
-        ({"aamode": "none", "focaldist": 0}, "16 samples a pixel"),
-        ({"aamode": "none"}, "16 samples a pixel, with depth; depth of field: report"),
-        ({"aamode": "none", "lattice": "centered"},
-         "first hits: 1 ray through the centre of a pixel, with depth; 16 samples a pixel; "
-         "depth of field: report"),
-        ({"focaldist": 0, "aa": 2}, "1 sample a pixel; edges: sobel; 3 further samples in edge pixels"),
-        ({"focaldist": 0, "aa": 2, "lattice": "centered", "aamode": "geometry"},
-         "1 sample a pixel, with depth, normal; edges: geometry; 4 further samples in edge pixels"),
-        ({"focaldist": 0, "aa": 1}, "1 sample a pixel"),
-        ({"focaldist": 0, "aa": 1, "layers": ["edges"]}, "1 sample a pixel; edges: sobel"),
-    ],
-)  # fmt: skip
-def test_the_plan_shows_the_passes_that_run(options: dict[str, Any], passes: str) -> None:
+shown = Cases()
+shown({"aamode": "none", "focaldist": 0}, "16 samples a pixel")
+shown({"aamode": "none"}, "16 samples a pixel, with depth; depth of field: report")
+shown(
+    {"aamode": "none", "lattice": "centered"},
+    "first hits: 1 ray through the centre of a pixel, with depth; 16 samples a pixel; depth of field: report",
+)
+shown({"focaldist": 0, "aa": 2}, "1 sample a pixel; edges: sobel; 3 further samples in edge pixels")
+shown(
+    {"focaldist": 0, "aa": 2, "lattice": "centered", "aamode": "geometry"},
+    "1 sample a pixel, with depth, normal; edges: geometry; 4 further samples in edge pixels",
+)
+shown({"focaldist": 0, "aa": 1}, "1 sample a pixel")
+shown({"focaldist": 0, "aa": 1, "layers": ["edges"]}, "1 sample a pixel; edges: sobel")
+
+
+@pytest.mark.parametrize(("options", "passes"), shown)
+def test_the_plan_shows_the_passes_that_run(options, passes):
     result = mrt.render(3, width=16, height=12, **options)
     lines = str(result.plan).splitlines()
     assert "; ".join(line.removeprefix("  pass    ") for line in lines if "  pass" in line) == passes
     assert list(result.timings.passes) == [step.name for step in result.plan.passes]
 
 
-def test_settings_are_the_options_of_render() -> None:
+def test_settings_are_the_options_of_render():
     """One table: what ``render`` takes is what ``RenderSettings`` checks, with the same defaults."""
     taken = dict(inspect.signature(mrt.render).parameters)
     assert taken.pop("scene").default == 0
@@ -128,6 +125,6 @@ assert "tangent" in usage()
 """
 
 
-def test_a_new_layer_takes_one_row(run_python) -> None:
+def test_a_new_layer_takes_one_row(run_python):
     """Plan, tracer, files and help read it from there."""
     run_python(NEW_LAYER)

@@ -48,7 +48,7 @@ def lines(run_python, code: str, *arguments: str) -> list[str]:
     return done.stdout.split()
 
 
-def test_is_idempotent_and_needs_a_variant(run_python) -> None:
+def test_is_idempotent_and_needs_a_variant(run_python):
     """Functions under ``dr.syntax`` are rewritten when they are called; the decorator is again Dr.Jit's."""
     code = """
 import drjit as dr
@@ -79,7 +79,7 @@ for _ in range(2):
     "order",
     [("scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral"), ("llvm_ad_spectral", "scalar_rgb", "llvm_ad_rgb")],
 )
-def test_plugins_follow_every_order_of_switches(run_python, order: tuple[str, ...]) -> None:
+def test_plugins_follow_every_order_of_switches(run_python, order):
     """Registered in the first; there after each switch, also back, under stock integrators and ours."""
     code = """
 import sys

@@ -14,15 +14,12 @@ from mrt_mitsuba.rendering.api import render
 
 
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])
-def test_large_surfaces_near_the_origin_have_no_dark_spots(variant: str, kind: str) -> None:
+def test_large_surfaces_near_the_origin_have_no_dark_spots(variant, kind):
     """What a hit is off by goes with the coordinates of the shape, not with its own, which are near zero."""
     numbers = {"sphere": [[0, -1000, 0, 1000]], "cylinder": [[-900, -1000, 0, 900, -1000, 0, 1000]]}[kind]
-    scene = {
-        "type": "scene",
-        "sensor": sensor([0.3, 2, 3], [0, 0, 0], (160, 120), fov=20),
-        "light": {"type": "mrt_light", "position": [0.3, 2, 3]},
-        "large": group(numbers, kind=kind),
-    }
+    scene = {"type": "scene", "large": group(numbers, kind=kind)}
+    scene["sensor"] = sensor([0.3, 2, 3], [0, 0, 0], (160, 120), fov=20)
+    scene["light"] = {"type": "mrt_light", "position": [0.3, 2, 3]}
     assert (render(scene, aa=1, lattice="report").image > 0.02).all()
 
 
@@ -35,39 +32,55 @@ def floor(kind: str, half: float, turn: mi.ScalarTransform4f) -> dict[str, Any]:
 
 @pytest.mark.parametrize("kind", ["rectangle", "mesh"])
 @pytest.mark.parametrize(("place", "half"), [((0, 0, 0), 1.0), ((3, 2, 1), 1.0), ((3, 2, 1), 1e4)])
-def test_a_grain_on_a_wide_floor_has_its_shadow(variant: str, kind: str, place: tuple, half: float) -> None:
+def test_a_grain_on_a_wide_floor_has_its_shadow(variant, kind, place, half):
     """A ball of radius 0.005, as ``direct`` draws it."""
     turn = mi.ScalarTransform4f().translate(list(place)).rotate([1, 0, 0], -90)
-    eye, goal = np.add(place, [0.05, 0.06, 0.05]).tolist(), np.add(place, [0, 0.005, 0]).tolist()
+    eye = np.add(place, [0.05, 0.06, 0.05]).tolist()
+    goal = np.add(place, [0, 0.005, 0]).tolist()
     grain = {"type": "sphere", "center": [place[0], place[1] + 0.005, place[2]], "radius": 0.005}
     lamp = [place[0] + 0.3, place[1] + 0.5, place[2] - 0.2]
-    scene = mi.load_dict({
-        "type": "scene", "floor": floor(kind, half, turn), "grain": grain,
-        "sensor": sensor(eye, goal, (160, 120), fov=25, near_clip=1e-3),
-        "light": {"type": "point", "position": lamp},
-    })  # fmt: skip
-    ours = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
-    both = (mi.load_dict(integrator) for integrator in (ours, {"type": "direct"}))
-    images = [np.array(mi.render(scene, integrator=i, spp=1)) for i in both]
-    dark = [(image < 1e-3 * images[1].max()).all(axis=-1) for image in images]
+    nodes = {"type": "scene", "floor": floor(kind, half, turn), "grain": grain}
+    nodes["sensor"] = sensor(eye, goal, (160, 120), fov=25, near_clip=1e-3)
+    nodes["light"] = {"type": "point", "position": lamp}
+    scene = mi.load_dict(nodes)
+
+    def draw(**integrator: Any) -> np.ndarray:
+        return np.array(mi.render(scene, integrator=mi.load_dict(integrator), spp=1))
+
+    ours = draw(type="mrt_whitted", max_depth=1, clamp=False, min_contribution=0.0)
+    direct = draw(type="direct")
+    dark = [(image < 1e-3 * direct.max()).all(axis=-1) for image in (ours, direct)]
     assert 700 < dark[1].sum() < 900
     # Rays of ``direct`` start 9e-5 (1 + |p|) off, 2 to 8 % of the ball's radius, and the rim moves with them
     assert (dark[0] != dark[1]).sum() < 60
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e11])
-def test_meshes_that_rays_cannot_meet_are_refused(variant: str, size: float) -> None:
-    scene = {
-        "type": "scene",
-        "sensor": sensor([0, 0, 6 * size], [0, 0, 0], (4, 3)),
-        "floor": floor("mesh", 0.5 * size, mi.ScalarTransform4f()),
-    }
+def test_meshes_that_rays_cannot_meet_are_refused(variant, size):
+    scene = {"type": "scene", "sensor": sensor([0, 0, 6 * size], [0, 0, 0], (4, 3))}
+    scene["floor"] = floor("mesh", 0.5 * size, mi.ScalarTransform4f())
     with pytest.raises(SceneError, match=r'the mesh "floor" is .* across .*: scale the scene'):
         render(scene, aa=1)
 
 
+def test_a_mesh_in_a_group_is_refused_once_it_has_grown(variant):
+    """What instances show is looked at again when it has changed."""
+    nodes: dict[str, Any] = {"type": "scene", "integrator": {"type": "mrt_whitted"}}
+    nodes["sensor"] = sensor([0, 0, 6], [0, 0, 0], (4, 3))
+    nodes["group"] = {"type": "shapegroup", "floor": floor("mesh", 0.5, mi.ScalarTransform4f())}
+    nodes["instance"] = {"type": "instance", "of": {"type": "ref", "id": "group"}}
+    scene = mi.load_dict(nodes)
+    render(scene, aa=1)
+    parameters = mi.traverse(scene)
+    (key,) = (key for key, _ in parameters if key.endswith("vertex_positions"))
+    parameters[key] = parameters[key] * 1e11
+    parameters.update()
+    with pytest.raises(SceneError, match=r"the mesh .* is .* across .*: scale the scene"):
+        render(scene, aa=1)
+
+
 @pytest.mark.parametrize("size", [1e-7, 1e9])
-def test_meshes_are_drawn_at_every_size_that_is_taken(variant: str, size: float) -> None:
+def test_meshes_are_drawn_at_every_size_that_is_taken(variant, size):
     """The picture is that at size 1, with triangles in all directions."""
     rng = np.random.default_rng(1)
     corners = rng.normal(size=(60, 3))
@@ -75,15 +88,13 @@ def test_meshes_are_drawn_at_every_size_that_is_taken(variant: str, size: float)
 
     def picture(s: float) -> np.ndarray:
         clips = {"near_clip": 0.01 * s, "far_clip": 1e4 * s}
-        scene = {
-            "type": "scene",
-            "embree_use_robust_intersections": True,
-            "sensor": sensor([0, 0, 6 * s], [0, 0, 0], (48, 36), fov=30, **clips),
-            "light": {"type": "mrt_light", "position": [2 * s, 3 * s, 5 * s]},
-            "mesh": {**mesh(corners * s, faces), "bsdf": {"type": "mrt_bsdf"}},
-        }
+        scene = {"type": "scene", "embree_use_robust_intersections": True}
+        scene["sensor"] = sensor([0, 0, 6 * s], [0, 0, 0], (48, 36), fov=30, **clips)
+        scene["light"] = {"type": "mrt_light", "position": [2 * s, 3 * s, 5 * s]}
+        scene["mesh"] = mesh(corners * s, faces) | {"bsdf": {"type": "mrt_bsdf"}}
         return render(scene, aa=1).image
 
     unit = picture(1.0)
     assert unit.std() > 0.01
-    assert (np.abs(picture(size) - unit) > 1e-3).any(axis=-1).mean() < 2e-3
+    off = np.abs(picture(size) - unit) > 1e-3
+    assert off.any(axis=-1).mean() < 2e-3

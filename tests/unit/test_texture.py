@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from PIL import Image
 
 from mrt_mitsuba.scene.model import Camera, Material, Scene, Sphere
@@ -38,7 +39,7 @@ def expected(values: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
-def test_look_up_is_the_report_s(picture, variant: str) -> None:
+def test_look_up_is_the_report_s(picture, variant):
     path, values = picture
     count = 10_000 if variant.startswith("llvm") else 20
     places = np.random.default_rng(2).uniform(-0.5, 1.5, (2, count)).astype(np.float32)
@@ -48,24 +49,26 @@ def test_look_up_is_the_report_s(picture, variant: str) -> None:
         if variant.startswith("llvm"):
             got = look_up(texture, u, v)
         else:
-            si, got = dr.zeros(mi.SurfaceInteraction3f), []
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            got = []
             for si.uv in zip(u.tolist(), v.tolist(), strict=True):
                 got.append(list(texture.eval(si)))
         # Texels are stored in float32, 1/255 rounded once
-        np.testing.assert_allclose(got, expected(values, u, v), atol=1e-7)
+        assert_allclose(got, expected(values, u, v), atol=1e-7)
 
 
 @pytest.mark.parametrize("mode", ["P", "LA"])
-def test_other_kinds_of_pictures(tmp_path: Path, mode: str) -> None:
+def test_other_kinds_of_pictures(tmp_path, mode):
     values = np.tile(np.array([[0, 80], [160, 240]], np.uint8)[:, :, None], (1, 1, 3))
     image = Image.fromarray(values).convert(mode)
     image.save(tmp_path / "grey.png")
-    u, v = np.array([0, 1, 0, 1], np.float32), np.array([0, 0, 1, 1], np.float32)
+    u = np.array([0, 1, 0, 1], np.float32)
+    v = np.array([0, 0, 1, 1], np.float32)
     got = look_up(mi.load_dict({"type": "mrt_texture", "filename": str(tmp_path / "grey.png")}), u, v)
-    np.testing.assert_allclose(got[:, 0] * 255, np.array(image.convert("L")).ravel(), atol=1e-4)
+    assert_allclose(got[:, 0] * 255, np.array(image.convert("L")).ravel(), atol=1e-4)
 
 
-def test_standard_texturing_is_bilinear_and_decodes_srgb(picture) -> None:
+def test_standard_texturing_is_bilinear_and_decodes_srgb(picture):
     path, values = picture
     ball = Sphere((0, 0, 0), 1.0, Material(1.0, 0.5, (0, 0, 0), (0.5, 0.5, 0.5), str(path)))
     scene = Scene(Camera((0, 0, 2), (0, 0, 0)), (0, 0, 0), (), spheres=(ball,), texturing="standard")
@@ -77,4 +80,4 @@ def test_standard_texturing_is_bilinear_and_decodes_srgb(picture) -> None:
     si.shape = mi.ShapePtr(shape)
     between = shape.bsdf().eval_diffuse_reflectance(si).numpy()[:, 0]
     # texels in half precision or 8 bits
-    np.testing.assert_allclose(between, decoded[2, :2].mean(axis=0), atol=2e-3)
+    assert_allclose(between, decoded[2, :2].mean(axis=0), atol=2e-3)

@@ -1,0 +1,144 @@
+"""Every door to a render leads through one plan: what is refused, shown on the way, and stated."""
+
+import io
+import sys
+import types
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from cases import Cases
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.rendering.plan import Rounds
+from mrt_mitsuba.rendering.progress import NotebookProgress, TerminalProgress, default_progress
+
+SIZE = 16
+
+
+@pytest.fixture(autouse=True)
+def _plugins():
+    mrt.register()
+
+
+def box():
+    """Mitsuba's Cornell box, small."""
+    scene = mi.cornell_box()
+    film = scene["sensor"]["film"]
+    film["width"] = SIZE
+    film["height"] = SIZE
+    return scene
+
+
+def adaptive(**parameters):
+    return {"type": "mrt_adaptive", "nested": {"type": "path"}, **parameters}
+
+
+def goal_of(result):
+    step = next(step for step in result.plan.passes if isinstance(step, Rounds))
+    return step.goal
+
+
+def test_a_render_inside_freeze_is_refused_with_the_way_out():
+    scene = mi.load_dict(box())
+    integrator = mi.load_dict(adaptive(spp=16))
+
+    @dr.freeze
+    def by_mitsuba(factor):
+        return mi.render(scene, integrator=integrator) * factor
+
+    @dr.freeze
+    def by_us(factor):
+        return mi.TensorXf(mrt.render(scene, integrator="path", spp=2).image) * factor
+
+    for frozen in (by_mitsuba, by_us):
+        with pytest.raises(RuntimeError) as caught:
+            frozen(mi.Float(1))
+        first = caught.value
+        while first.__cause__ is not None:
+            first = first.__cause__
+        assert isinstance(first, UsageError)
+        assert "mrt.prepare" in str(first)
+    assert np.isfinite(mrt.render(scene, integrator="path", spp=2).image).all()  # nothing is left behind
+
+
+@pytest.mark.parametrize("target", ["x%", "-1%", "0%", "inf%", "%", "2 %"])
+def test_a_percentage_that_is_none_is_refused_by_every_door(target, tmp_path):
+    with pytest.raises(UsageError, match="target="):
+        mrt.render(0, target=target)
+    with pytest.raises(RuntimeError, match="percentage"):
+        mi.load_dict(adaptive(target=target))
+    file = tmp_path / "scene.xml"
+    file.write_text(
+        '<scene version="3.0.0"><integrator type="mrt_adaptive"><string name="target" '
+        f'value="{target}"/><integrator type="path"/></integrator></scene>'
+    )
+    with pytest.raises(RuntimeError, match="percentage"):
+        mi.load_file(str(file))
+
+
+goals = Cases()
+goals({"spp": 20}, {}, 20, None, name="its own rays")
+goals({"target": 9.0}, {}, 4096, 9.0, name="its own target")
+goals({"target": "900%"}, {}, 4096, "900%", name="relative")
+goals({"target": 9.0, "max_spp": 50}, {"maxspp": 40}, 40, 9.0, name="a bound of the caller's")
+goals({"target": 9.0}, {"target": 8.0}, 4096, 8.0, name="a target of the caller's")
+
+
+@pytest.mark.parametrize(("stated", "options", "most", "target"), goals)
+def test_a_plan_holds_what_the_integrator_states_and_the_caller_asks(stated, options, most, target):
+    result = mrt.render(box(), integrator=mi.load_dict(adaptive(**stated)), **options)
+    goal = goal_of(result)
+    assert goal.most == most
+    assert (goal.target and goal.target.plain) == target
+    assert result.options.get("target") == target
+
+
+def test_the_plan_says_what_a_relative_target_is_a_share_of():
+    plan = str(mrt.render(box(), integrator="path", target="900%").plan)
+    assert "to an error of 900% of the mean luminance, at most 4096 a pixel" in plan
+
+
+def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):
+    shown = []
+
+    class Handle:
+        def update(self, html):
+            shown.append(html)
+
+    def display(html, display_id):
+        assert display_id
+        shown.append(html)
+        return Handle()
+
+    fake = types.ModuleType("IPython.display")
+    fake.HTML = str
+    fake.display = display
+    monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
+    monkeypatch.setitem(sys.modules, "IPython.display", fake)
+    monkeypatch.setitem(sys.modules, "ipykernel", types.ModuleType("ipykernel"))
+    progress = default_progress()
+    assert isinstance(progress, NotebookProgress)
+    progress.bar_file = io.StringIO()
+    result = mrt.render(box(), integrator="path", spp=64, aamode="noise", progress=progress)
+    assert len(shown) == len(result.rounds)
+    for html, found in zip(shown, result.rounds, strict=True):
+        assert html.startswith('<img src="data:image/png;base64,')
+        assert f"error {found.rmse:.2g}, {found.spp:.0f} rays a pixel" in html
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_shows_rounds_on_one_line():
+    lines = io.StringIO()
+    bars = Terminal()
+    progress = TerminalProgress(file=lines, bar_file=bars)
+    mrt.render(box(), integrator="path", spp=64, aamode="noise", progress=progress)
+    assert not lines.getvalue()
+    assert "\n" not in bars.getvalue().strip()
+    assert "error" in bars.getvalue()

@@ -1,0 +1,357 @@
+"""Programs that never use our plugins: ``mrt.register()`` leaves Mitsuba to them as it was."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from mrt_mitsuba import runtime
+
+pytestmark = pytest.mark.skipif(runtime.obstacle(runtime.FAST) is not None, reason="needs LLVM")
+
+LOOK = """
+import inspect, pickle, sys
+import mrt_mitsuba as mrt
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+
+def functions():
+    yield mi, ("render", "load_dict", "load_file", "load_string")
+    yield mi.SceneParameters, ("update", "__setitem__")
+    yield mi.AdjointIntegrator, ("render",)
+
+def tried(function, *arguments):
+    try:
+        return function(*arguments)
+    except Exception as error:
+        return type(error).__name__
+
+def look():
+    facts = {}
+    for owner, names in functions():
+        for name in names:
+            function = getattr(owner, name)
+            facts[name, str(owner)] = (
+                *(getattr(function, key) for key in ("__name__", "__qualname__", "__module__", "__doc__")),
+                str(tried(inspect.signature, function)),
+            )
+    facts["arguments"] = inspect.getfullargspec(mi.render), inspect.getfullargspec(mi.SceneParameters.update)
+    facts["pickle"] = pickle.dumps(mi.render), pickle.dumps(mi.SceneParameters.update)
+    assert pickle.loads(facts["pickle"][0]) is mi.render
+    return facts
+
+def same():
+    return [getattr(owner, name) for owner, names in functions() for name in names]
+"""
+
+NAMES = """
+before, functions_before = look(), same()
+mrt.register()
+after = look()
+print(*[key for key in before if before[key] != after[key]], sep="\\n")
+mrt.register(guard=False)
+print(all(a is b for a, b in zip(same(), functions_before, strict=True)))
+print("render" in vars(mi.AdjointIntegrator), mi.render is sys.modules["mitsuba.python.util"].render)
+mrt.register()
+print(all(a is not b for a, b in zip(same(), functions_before, strict=True)))
+"""
+
+
+def test_names_signatures_and_pickles_stay(run_python):
+    """And with ``guard=False`` the functions are Mitsuba's own again."""
+    assert run_python(LOOK + NAMES).stdout.split("\n") == ["", "True", "False True", "True", ""]
+
+
+CALLS = """
+import mrt_mitsuba as mrt
+mrt.register()
+import mitsuba as mi
+text = '''<scene version="3.0.0">
+    <default name="source" value="1"/><default name="kind" value="sphere"/>
+    <shape type="$kind"><float name="radius" value="$source"/></shape></scene>'''
+with open("a.xml", "w") as file:
+    file.write(text)
+
+def radius(scene):
+    return round(float(scene.bbox().max[0]), 5)
+
+print(radius(mi.load_file("a.xml", source="3")), radius(mi.load_file(path="a.xml", source="2")))
+print(radius(mi.load_string(value=text)), radius(mi.load_string(text, source="4", parallel=False)))
+ball = {"type": "scene", "a": {"type": "sphere", "radius": 5.0}}
+print(radius(mi.load_dict(dict=ball)), radius(mi.load_dict(ball, True, optimize=False)))
+for load in (mi.load_dict, mi.load_file):
+    for arguments in ((), (3,)):
+        try:
+            load(*arguments)
+        except TypeError as error:
+            print(str(error).split("(")[0])
+"""
+
+
+def test_loaders_take_all_that_they_took(run_python):
+    lines = run_python(CALLS).stdout.splitlines()
+    assert lines[:3] == ["3.0 2.0", "1.0 4.0", "5.0 5.0"]
+    assert lines[3:] == [*["load_dict"] * 2, *["load_file"] * 2]
+
+
+FILES = """
+import os, resource
+import mrt_mitsuba as mrt
+mrt.register()
+import mitsuba as mi
+os.mkdir("folder")
+with open("huge.xml", "wb") as file:
+    file.truncate(2**40)  # takes no place on the disk
+resource.setrlimit(resource.RLIMIT_AS, (2**33, 2**33))
+for path in ("/dev/zero", "folder", "missing.xml", "huge.xml"):
+    try:
+        print(path, len(mi.load_file(path).shapes()))
+    except RuntimeError as error:
+        print(path, "refused")
+    except MemoryError:
+        print(path, "refused")
+"""
+
+
+def test_files_are_read_no_further_than_needed(run_python):
+    """Zeros without end were read until memory ended; ``run_python`` waits five minutes."""
+    lines = run_python(FILES).stdout.splitlines()
+    assert lines == [f"{path} refused" for path in ("/dev/zero", "folder", "missing.xml", "huge.xml")]
+
+
+THREADS = """
+import threading
+import mrt_mitsuba as mrt
+mrt.register()
+import mitsuba as mi
+
+class Threaded(mi.SamplingIntegrator):
+    def __init__(self, props):
+        mi.SamplingIntegrator.__init__(self, props)
+        self.inner = mi.load_dict({"type": "direct"})
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        found = []
+        def work():
+            found.append(mi.render(scene, integrator=self.inner, spp=2))
+            parameters = mi.traverse(scene)
+            key = next(key for key in parameters.keys() if key.endswith("reflectance.value"))
+            parameters[key] = [0.1, 0.2, 0.3]
+            parameters.update()
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+        return found[0]
+
+mi.register_integrator("threaded", Threaded)
+mi.load_dict({"type": "mrt_bsdf"})  # there are some of ours
+for kind in ("diffuse", "mrt_bsdf"):
+    key = "reflectance" if kind == "diffuse" else "diffuse_reflectance"
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "threaded"}, "light": {"type": "constant"},
+        "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 6}},
+        "ball": {"type": "sphere", "center": [0, 0, 4],
+                 "bsdf": {"type": kind, key: {"type": "rgb", "value": 0.5}}}})
+    print(mi.render(scene).shape)
+"""
+
+
+def test_an_integrator_may_render_in_threads_of_its_own(run_python):
+    """It waited for ever for its own render to end."""
+    assert run_python(THREADS).stdout.splitlines() == ["(6, 8, 3)"] * 2
+
+
+FORK = """
+import os, sys, threading, time
+import mrt_mitsuba as mrt
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+mrt.register()
+inside, done = threading.Event(), threading.Event()
+
+class Waiting(mi.BSDF):  # so that a render is under way
+    def __init__(self, props):
+        mi.BSDF.__init__(self, props)
+        self.m_components, self.m_flags = [mi.BSDFFlags.DiffuseReflection], mi.BSDFFlags.DiffuseReflection
+    def eval(self, ctx, si, wo, active=True):
+        inside.set()
+        done.wait(60)
+        return mi.Spectrum(0)
+    def pdf(self, *_): return 0.0
+    def eval_pdf(self, *_): return self.eval(*_), 0.0
+    def sample(self, *_): return mi.BSDFSample3f(), mi.Spectrum(0)
+
+mi.register_bsdf("waiting", Waiting)
+scene = mi.load_dict({
+    "type": "scene", "integrator": {"type": "mrt_whitted"}, "light": {"type": "mrt_light"},
+    "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 2, "height": 2}},
+    "ball": {"type": "sphere", "center": [0, 0, 4], "bsdf": {"type": "waiting"}}})
+other = mi.load_dict({"type": "sphere", "bsdf": {"type": "diffuse"}})
+thread = threading.Thread(target=lambda: mi.render(scene, spp=1), daemon=True)
+thread.start()
+assert inside.wait(60)
+child = os.fork()
+if child == 0:
+    parameters = mi.traverse(other)
+    key = next(key for key in parameters.keys() if key.endswith("reflectance.value"))
+    parameters[key] = 0.25
+    parameters.update()
+    os._exit(7)
+for _ in range(300):
+    ended, status = os.waitpid(child, os.WNOHANG)
+    if ended:
+        break
+    time.sleep(0.1)
+else:
+    os.kill(child, 9)
+print(os.waitstatus_to_exitcode(status) if ended else "waits", flush=True)
+done.set()
+os._exit(0)
+"""
+
+
+def test_a_fork_during_a_render_does_not_inherit_its_lock(run_python):
+    assert run_python(FORK).stdout.split() == ["7"]
+
+
+WRAPPERS = """
+import functools
+import mrt_mitsuba as mrt
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+calls = []
+
+def counted(function):
+    @functools.wraps(function)
+    def call(*args, **given):
+        calls.append(function.__name__)
+        return function(*args, **given)
+    return call
+
+mi.load_dict, mi.load_string = counted(mi.load_dict), counted(mi.load_string)
+theirs = mi.load_dict
+mrt.register()
+cone = {"type": "mrt_cone", "apex": [0, 1, 0], "base_center": [0, 0, 0], "segments": 3}
+scene = {"type": "scene"} | {f"c{k}": cone | {"radius": 1 + k / 1500} for k in range(1500)}
+print(len(mi.load_dict(scene).shapes()), "load_dict" in calls)
+mi.load_dict = counted(mi.load_dict)  # and around ours
+calls.clear()
+mrt.register()
+print(len(mi.load_dict(scene).shapes()), calls.count("load_dict"))
+mrt.register(guard=False)
+calls.clear()
+print(len(mi.load_dict({"type": "scene", "a": cone}, parallel=False).shapes()), calls.count("load_dict"))
+mrt.register()
+print(len(mi.load_dict(scene).shapes()))
+"""
+
+
+def test_somebody_elses_wrapper_is_not_taken_for_ours(run_python):
+    """Without ours, so many cones end in a RecursionError."""
+    assert run_python(WRAPPERS).stdout.splitlines() == ["1500 True", "1500 2", "1 2", "1500"]
+
+
+COUNTS = """
+import sys, threading
+import mrt_mitsuba as mrt
+mrt.register()
+import drjit as dr
+import mitsuba as mi
+before = dr.thread_count()
+for count in (1, 3):
+    dr.set_thread_count(count)
+    for _ in range(20):
+        load = lambda: mi.load_dict({"type": "scene", "a": {"type": "sphere"}, "b": {"type": "mrt_bsdf"}})
+        threads = [threading.Thread(target=load) for _ in range(8)]
+        [thread.start() for thread in threads]
+        [thread.join() for thread in threads]
+    print(dr.thread_count())
+"""
+
+
+def test_loads_at_once_leave_the_number_of_threads(run_python):
+    assert run_python(COUNTS).stdout.split() == ["1", "3"]
+
+
+SWITCH = """
+import mrt_mitsuba as mrt
+mrt.register()
+import mitsuba as mi
+for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
+    mi.set_variant(variant)  # by Mitsuba's own door
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film},
+                          "light": {"type": "mrt_light"}})
+    try:
+        mi.load_dict({"type": "ptracer"}).render(scene, scene.sensors()[0], spp=1)
+    except NotImplementedError as error:
+        print(variant, str(error).split(":")[0])
+"""
+
+
+def test_changes_follow_the_variant(run_python):
+    names = re.findall(
+        r"((?:scalar|llvm)_\w+) mrt_light", run_python(SWITCH).stdout
+    )  # among what Mitsuba logs
+    assert names == ["scalar_rgb", "llvm_ad_mono", "llvm_ad_rgb"]
+
+
+INTERRUPT = """
+import os, signal, sys, threading
+import mrt_mitsuba as mrt
+mrt.register()
+import mitsuba as mi
+box = mi.cornell_box()
+nested = {"type": sys.argv[1]}
+scene = mi.load_dict(box | {"integrator": {
+    "type": "mrt_adaptive", "target": 1e-6, "max_spp": 10**6, "max_seconds": 60.0, "nested": nested}})
+threading.Timer(float(sys.argv[2]), lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+try:
+    mi.render(scene)
+except BaseException as error:
+    print(type(error).__name__, signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+"""
+
+
+@pytest.mark.parametrize("nested", ["path", "ptracer"])
+@pytest.mark.parametrize("delay", [0.3, 2.0])
+def test_ctrl_c_during_mrt_adaptive_is_a_keyboard_interrupt(run_python, nested, delay):
+    lines = run_python(INTERRUPT, nested, str(delay)).stdout.splitlines()
+    assert lines[-1].endswith("KeyboardInterrupt True")  # after what Mitsuba logs
+
+
+def test_every_change_is_on_the_page() -> None:
+    from mrt_mitsuba.mitsuba_changes import CHANGES
+
+    page = (Path(__file__).resolve().parents[2] / "docs" / "plugins.rst").read_text()
+    for change in CHANGES:
+        assert f"``{change.where}``" in page
+        assert change.what
+        assert change.why
+
+
+NESTED = """
+import sys
+import mrt_mitsuba as mrt
+mrt.register()
+import mitsuba as mi
+film = {"type": "hdrfilm", "width": 4, "height": 4}
+inner = {"type": "mrt_adaptive", "nested": {"type": "path"}}
+outer = {"type": sys.argv[1], "inner": inner} | ({"aovs": "d:depth"} if sys.argv[1] == "aov" else {})
+scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film}, "integrator": outer,
+                      "light": {"type": "constant"}})
+try:
+    mi.render(scene, spp=4)
+except Exception as error:
+    while error:
+        print(error)
+        error = error.__cause__
+"""
+
+
+@pytest.mark.parametrize("outer", ["aov", "moment"])
+def test_mrt_adaptive_says_that_it_is_no_part_of_another(run_python, outer: str) -> None:
+    done = run_python(NESTED, outer)
+    assert "mrt_adaptive: it is no part of another integrator" in done.stdout

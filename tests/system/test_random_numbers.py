@@ -1,0 +1,75 @@
+"""Random numbers of a render: every ray has its own, in all passes, frames, rounds and parts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cases import Cases
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.machine import Workspace
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SIZE = {"width": 24, "height": 18}
+MOVING = {"motion": (0.2, 0, 0), "motionsamples": 4}
+STEPS = 2**24  # numbers in [0, 1) that a sampler draws
+
+
+def recorder() -> Any:
+    """An integrator that sees black or white by chance; ``drawn`` has the numbers of each ray, 48 bits."""
+
+    class Draws(mi.SamplingIntegrator):
+        def __init__(self, props: mi.Properties) -> None:
+            mi.SamplingIntegrator.__init__(self, props)
+            self.drawn: list[np.ndarray] = []
+
+        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
+            first, second = np.array([sampler.next_1d(), sampler.next_1d()], np.float64)
+            self.drawn.append(first * STEPS**2 + second * STEPS)
+            return mi.Spectrum(mi.Float(np.floor(first + 0.5))), mi.Bool(True), []
+
+        def to_string(self) -> str:
+            return "Draws[]"
+
+    return Draws(mi.Properties())
+
+
+REPORT = {"lattice": "report"}
+REFINED = {"aamode": "luma", "aa": 2}
+passes = Cases()
+passes({"aamode": "none", "aa": 3, **REPORT}, name="lattice")
+passes({**REFINED, **REPORT}, name="lattice, refined")
+passes({**REFINED, **REPORT, **MOVING}, name="lattice, refined frame by frame")
+passes({**REFINED, "spp": 2}, name="film, refined")
+passes({"aamode": "none", "aa": 1, "spp": 3, **MOVING, "motionmode": "stratified"}, name="moments")
+passes({"aamode": "noise", "spp": 32}, name="rounds")
+
+
+@pytest.mark.parametrize("at_once", [2**24, 500])
+@pytest.mark.parametrize("options", passes)
+def test_no_two_rays_draw_the_same(options, at_once, monkeypatch):
+    """Of some thousand rays, two have the same 48 bits by chance once in ten million renders."""
+    monkeypatch.setattr(Workspace, "rays_at_once", lambda self, channels: at_once)
+    scene = mi.load_dict(mrt.scene_dict(0, **SIZE))
+    integrator = recorder()
+    result = mrt.render(scene, integrator=integrator, seed=3, **options)
+    drawn = np.concatenate(integrator.drawn)
+    assert len(drawn) == result.rays["primary"] > 24 * 18
+    assert len(np.unique(drawn)) == len(drawn)
+
+
+def test_parts_of_a_whole_picture_draw_numbers_of_their_own(monkeypatch):
+    """Light tracing renders a picture in parts that fit into memory; equal ones would add nothing."""
+    box = mi.cornell_box()
+    box["sensor"]["film"] |= SIZE
+    scene = mi.load_dict(box)
+    options = {"integrator": "ptracer", "aamode": "none", "seed": 3}
+    few = mrt.render(scene, spp=8, **options)
+    monkeypatch.setattr(Workspace, "rays_at_once", lambda self, channels: few.rays["primary"])
+    many = mrt.render(scene, spp=16, **options)
+    assert many.rays["primary"] == 2 * few.rays["primary"]
+    assert not np.allclose(many.image, few.image, rtol=1e-4)

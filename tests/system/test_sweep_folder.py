@@ -1,0 +1,191 @@
+"""The folder of a sweep: one sweep at a time, no trace of a killed one, and no damaged picture is kept."""
+
+from __future__ import annotations
+
+import fcntl
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.rendering.progress import Progress
+
+pytest.importorskip("distributed")
+pytestmark = pytest.mark.attack
+
+SMALL = {"width": 64, "height": 48, "aa": 1}
+PATIENCE = 120  # seconds for anything that processes do; a busy machine is no failure
+COMMAND = [sys.executable, "-m", "mrt_mitsuba.command.main"]
+SWEEP = "scene = 3\nwidth = 64\nheight = 48\naa = 1\n[grid]\nseed = [{}]\n"
+
+# What each worker runs first: seeds above 1 wait for a file
+WAITING = """
+import pathlib, time
+from mrt_mitsuba.rendering import api
+def render(*scene, seed=0, alone=api.render, **options):
+    while seed > 1 and not pathlib.Path("go").exists():
+        time.sleep(0.05)
+    return alone(*scene, seed=seed, **options)
+api.render = render
+"""
+
+
+class Meanwhile(Progress):
+    """Calls a function while a sweep is under way."""
+
+    def __init__(self, function):
+        self.function = function
+        self.errors = []
+
+    def stage(self, title, total, message=""):
+        try:
+            self.function()
+        except OutputError as error:
+            self.errors.append(str(error))
+        return super().stage(title, total, message)
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".exr", ".png")}
+
+
+def hidden(folder):
+    return [path.name for path in folder.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("name", ["out", "link", "out/../out"])
+def test_a_second_sweep_in_the_folder_is_refused(tmp_path, name):
+    """In the same process and in another, by whatever path; the first one is not disturbed."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (tmp_path / "link").symlink_to(out)
+    (tmp_path / "sweep.toml").write_text(SWEEP.format("7, 8"))
+    commands = []
+
+    def begin_another():
+        words = [*COMMAND, "sweep", name, "sweep.toml"]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE)
+        commands.append(done)
+        mrt.sweep(3, tmp_path / name, grid={"seed": [7, 8]}, **SMALL)
+
+    meanwhile = Meanwhile(begin_another)
+    table = mrt.sweep(3, out, grid={"seed": [1]}, workers=1, progress=meanwhile, **SMALL)
+    assert not table.failed
+    assert len(meanwhile.errors) == 1
+    assert "another sweep works there" in meanwhile.errors[0]
+    assert commands[0].returncode == 1
+    assert "another sweep works there" in commands[0].stderr
+    assert sorted(path.name for path in out.iterdir()) == ["seed=1.exr", "table.csv"]
+
+
+def test_a_killed_sweep_frees_the_folder_and_its_pictures_are_kept(tmp_path, monkeypatch, start):
+    (tmp_path / "waiting.py").write_text(WAITING)
+    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__PRELOAD", repr([str(tmp_path / "waiting.py")]))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sweep.toml").write_text(SWEEP.format("0, 1, 2"))
+    out = tmp_path / "out"
+    with start(*COMMAND, "sweep", "out", "sweep.toml", "workers=1") as process:
+        deadline = time.monotonic() + PATIENCE
+        while not list(out.glob(".mrt-*/seed=2.json")):  # the third picture has been begun
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+        process.wait(PATIENCE)
+    assert hidden(out)
+    (out / "table.csv").unlink()  # its last rows may not have been written
+    first = {path.name: path.stat().st_mtime_ns for path in out.glob("*.exr")}
+    (tmp_path / "go").touch()
+    table = mrt.sweep(3, out, grid={"seed": [0, 1, 2]}, workers=1, **SMALL)
+    assert [row["error"] for row in table.rows] == [""] * 3
+    assert hidden(out) == []
+    assert first.items() <= {path.name: path.stat().st_mtime_ns for path in out.glob("*.exr")}.items()
+
+
+def test_a_lock_file_that_a_killed_sweep_left_does_not_matter(tmp_path):
+    (tmp_path / ".mrt-sweep.lock").touch()
+    (tmp_path / ".mrt-sweep-of-the-user").mkdir()
+    assert not mrt.sweep(3, tmp_path, grid={"seed": [1]}, workers=1, **SMALL).failed
+    assert hidden(tmp_path) == [".mrt-sweep-of-the-user"]
+
+
+def test_without_locks_or_room_the_reason_is_said(tmp_path, monkeypatch):
+    def unsupported(file, operation):
+        raise OSError(95, "Operation not supported")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fcntl, "flock", unsupported)
+        with pytest.warns(MrtWarning, match="has no locks") as warned:
+            assert not mrt.sweep(3, tmp_path, workers=1, **SMALL).failed
+        assert warned[0].filename == __file__
+    assert hidden(tmp_path) == []
+    with pytest.raises(OutputError, match=r"cannot (write to|make) the folder /proc"):
+        mrt.sweep(3, "/proc", **SMALL)
+
+
+def flip(data, place):
+    data[place] ^= 4
+
+
+def blank(data, place):
+    data[place : place + 64] = bytes(64)
+
+
+def cut(data, place):
+    del data[place:]
+
+
+def drop(data, place):
+    data.clear()
+
+
+@pytest.mark.parametrize("damage", [flip, blank, cut, drop])
+def test_damaged_pictures_are_made_again(tmp_path, damage, capfd):
+    """Anywhere in the file: the header, the mark of the sweep in it, the table of rows, pixels, the end."""
+    options = {"grid": {"seed": range(5)}, "png": True, "workers": 1, **SMALL}
+    mrt.sweep(3, tmp_path, **options)
+    whole = contents(tmp_path)
+    names = sorted(whole)
+    for number, name in enumerate(names):
+        data = whole[name]
+        mark = data.index(b"mrt:sweep")
+        places = [0, 40, mark + 2, mark + 30, len(data) // 2, len(data) // 3, len(data) - 66]
+        damaged = bytearray(data)
+        damage(damaged, places[number % len(places)])
+        (tmp_path / name).write_bytes(damaged)
+        assert damaged != data
+    table = mrt.sweep(3, tmp_path, **options)
+    assert not table.failed
+    assert contents(tmp_path) == whole
+    assert capfd.readouterr() == ("", "")  # nothing of what libraries print about broken files
+
+
+def test_damaged_tiles_are_made_again(tmp_path):
+    """A folder stands where the picture should be written, so that its tiles stay."""
+    options = {"tiles": (2, 2), "workers": 1, "retries": 0, **SMALL}
+    (tmp_path / "picture.exr").mkdir()
+    with pytest.raises(OutputError, match="was not made by a sweep"):
+        mrt.sweep(3, tmp_path, **options)
+    (tmp_path / "picture.exr").rmdir()
+
+    class Late(Progress):
+        def stage(self, title, total, message=""):
+            (tmp_path / "picture.exr").mkdir()
+            return super().stage(title, total, message)
+
+    table = mrt.sweep(3, tmp_path, progress=Late(), **options)
+    assert "cannot put picture together" in table.failed[0]["error"]
+    (tmp_path / "picture.exr").rmdir()
+    for number, tile in enumerate(sorted((tmp_path / "picture.tiles").glob("*.exr"))[:3]):
+        data = bytearray(tile.read_bytes())
+        flip(data, len(data) * (number + 1) // 5)
+        tile.write_bytes(data)
+    table = mrt.sweep(3, tmp_path, **options)
+    assert not table.failed
+    assert read_exr(tmp_path / "picture.exr").image.tobytes() == mrt.render(3, **SMALL).image.tobytes()
+    assert not Path(tmp_path / "picture.tiles").exists()

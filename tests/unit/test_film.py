@@ -1,0 +1,44 @@
+"""What a film's filter makes of noise, against pictures that Mitsuba makes of random numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from nodes import sensor
+from numpy.testing import assert_allclose
+
+from mrt_mitsuba.rays.film import Film
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SIDE = 256
+SPP = 16
+
+
+def white_noise(film_sensor: mi.Sensor) -> np.ndarray:
+    """A picture [H, W] of independent random numbers, one a ray, of mean 0 and variance 1."""
+
+    class Uniform(mi.SamplingIntegrator):
+        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
+            value = 12**0.5 * (sampler.next_1d() - 0.5)
+            return mi.Spectrum(value), mi.Bool(True), []
+
+    scene = mi.load_dict({"type": "scene", "sensor": film_sensor})
+    return np.array(mi.render(scene, integrator=Uniform(mi.Properties()), spp=SPP))[..., 0]
+
+
+@pytest.mark.parametrize("rfilter", ["box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos"])
+def test_noise_under_a_filter_has_its_variance_and_correlation(rfilter):
+    look = mi.load_dict(sensor([0, 0, 1], [0, 0, 0], (SIDE, SIDE), rfilter=rfilter))
+    film = Film(look)
+    inner = white_noise(look)[8:-8, 8:-8]
+    # A variance of 57,600 values, each correlated with at most ten others, is known to 2 %
+    assert inner.var() * SPP == pytest.approx(film.averaging, rel=0.06)
+    power = np.abs(np.fft.fft2(inner / inner.std())) ** 2 / inner.size
+    # Exponential at each frequency: the mean square is twice the square of the mean, the spectrum
+    assert np.mean(power**2) / 2 == pytest.approx(film.correlation, rel=0.08)
+    alike = np.ones((1, *film.shape))
+    assert_allclose(film.spread_out(alike), alike, rtol=1e-6)
