@@ -3,6 +3,8 @@
 # make fuzz                            random inputs, ten thousand for each reader: a few minutes
 # make attack [ROUNDS=10]               hostile files, signals, threads, limits: some minutes; 100 rounds: an hour
 # make docs                            the documentation as a site: docs/_build/index.html
+# make pictures [ARGS="check"]          the pictures of README anew, in docs/pictures
+# make browser                         site, reports and pages of checks as an installed Chromium shows them
 # make bench  [ARGS="--compare F"]      time scenes 0-4 into out/bench.json
 # make test-gpu, make bench-gpu        the tests of what runs on a device, and its times, on an NVIDIA GPU
 # make setup                            the environment alone: .venv with the commands mrt and mrt-validate
@@ -18,7 +20,7 @@ BIN  := $(VENV)/bin
 # One stamp per set of extras: installing one leaves the others as they are.
 STAMP := $(VENV)/.mrt
 
-.PHONY: setup render test test-gpu fuzz attack bench bench-gpu docs lint types package clean
+.PHONY: setup render test test-gpu fuzz attack bench bench-gpu docs pictures browser lint types package clean
 setup: $(STAMP)-base
 
 render: $(STAMP)-base
@@ -60,6 +62,13 @@ types: $(STAMP)-dev
 docs: $(STAMP)-docs
 	$(BIN)/python -m sphinx -W -q -b html docs docs/_build
 
+pictures: $(STAMP)-browser
+	$(BIN)/python docs/pictures/make.py $(ARGS)
+
+# The site as make docs left it; if it has not, one without what the pages' code shows
+browser: $(STAMP)-browser
+	$(BIN)/python -m pytest -m browser $(ARGS)
+
 # Both are tried, in an environment of their own, before they are left in dist/
 package: $(STAMP)-dev $(STAMP)-test
 	$(BIN)/python -m pytest -m package
@@ -85,6 +94,10 @@ $(STAMP)-test: pyproject.toml | $(BIN)/python
 
 $(STAMP)-docs: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[docs,validation]'
+	@touch $@ $(STAMP)-base
+
+$(STAMP)-browser: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[test,docs,validation,browser]'
 	@touch $@ $(STAMP)-base
 
 $(STAMP)-dev: pyproject.toml | $(BIN)/python
