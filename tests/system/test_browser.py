@@ -6,19 +6,17 @@ docs`` left behind, else one that is built here without running the pages' code.
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
+import chromium as browsers  # docs/pictures
 import pytest
 
 import mrt_mitsuba as mrt
 
 DOCS = Path(__file__).parents[2] / "docs"
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 WIDTHS = (1200, 400)  # a window and a phone
 
 pytestmark = pytest.mark.browser
@@ -41,13 +39,11 @@ FACTS = """async () => {
 @pytest.fixture(scope="module")
 def chromium():
     playwright = pytest.importorskip("playwright.sync_api", reason="make browser installs it")
-    path = next(filter(None, map(shutil.which, NAMES)), None)
-    if path is None:
-        pytest.skip("no Chromium is installed")
-    # Chromium starts as root, as in containers, only without its sandbox; all pages are our own
-    alone = ["--no-sandbox"] if os.geteuid() == 0 else []
     with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=path, args=alone)
+        try:
+            browser = browsers.launch(started)
+        except browsers.MissingBrowser as missing:
+            pytest.skip(str(missing))
         yield browser
         browser.close()
 
@@ -121,7 +117,8 @@ def test_pages_are_whole(pages, width, chromium, request) -> None:
 def test_faults_of_a_page_are_found(chromium, tmp_path) -> None:
     page = tmp_path / "page.html"
     page.write_text(
-        "<body><img src='none.png' alt=''><a href='none.html'>x</a><a href='#none'>y</a>"
+        "<!doctype html><body style='margin: 0'>"
+        "<img src='none.png' alt=''><a href='none.html'>x</a><a href='#none'>y</a>"
         "<div style='width: 1300px'>z</div>"
         "<article><pre style='width: 20px; overflow: auto'>far too long</pre></article>"
         "<script>console.error('loud'); undefined.name</script>"
