@@ -203,7 +203,7 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
         return Result(
             image=layers["image"],
             layers=_channels(layers, plan),
-            plan=plan,
+            plan=plan if error is None else plan.resolved(error.target),
             timings=job.timings(),
             rays=job.rays,
             kernel_launches=job.launches,

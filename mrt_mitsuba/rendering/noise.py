@@ -29,6 +29,7 @@ SUSPECT = 0.5  # shape of a tail where rare rays may rule
 TILE = 16  # pixels that round alike, under a filter: it has rays traced around all that need some
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
 JUDGES = 2**11  # pixels, about, that choose the mixture
+LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB
 MISSED = 0.25  # of a pixel like those that make up the noise: it may be among the others, unseen
 STATED = 2  # squared errors that a stated variance counts as much as
 LEAST_RATIO = 0.05  # of squared errors to stated variances, to be believed: rare ones may be missing
@@ -139,6 +140,12 @@ class Halves(Stack):
         width = 1.96 * spread / 2
         high = rmse * math.exp(width * (1 + spread)) if tail <= DOUBTFUL else math.inf
         return ErrorEstimate(rmse, rmse * math.exp(-width), high, tail)
+
+    def luminance(self) -> float:
+        """The mean luminance of the picture, as the scouts have it, which no value in the picture decides."""
+        rays, total, _ = self._gathered(SCOUTS)
+        colors = self.film.picture(np.moveaxis(total / rays, 0, -1))
+        return float(colors.mean((0, 1)) @ LUMINANCE)
 
     def forecast(self) -> tuple[float, float]:
         """Return the RMSE of the picture, and the shape of its tail, as the scouts have them."""

@@ -170,17 +170,11 @@ class Passes:
         exposer = Exposer(self._job, self._shader, self._shader.film, step.layers)
         halves = Halves if self._shader.layers else Wholes
         picture = halves(exposer, self._seed, self._blurred if self._plan.blur else None)
-        self.rounds, self.error = run_rounds(
-            picture,
-            self._job.stage,
-            rays=step.goal.most,
-            target=None if step.goal.target is None else step.goal.target.value,
-            seconds=step.goal.seconds,
-            on_round=self._job.on_round,
-        )
+        self.rounds, self.error = run_rounds(picture, self._job.stage, step.goal, self._job.on_round)
         self._develop(exposer, picture.mean())
         variance = picture.variance()[self._seen]
-        self._layer("variance")[:] = variance
+        with np.errstate(over="ignore"):  # of errors beyond float32
+            self._layer("variance")[:] = variance
         self._layer("error")[:] = np.sqrt(variance.mean(-1, keepdims=True))
         self._layer("samples")[..., 0] = picture.samples()[self._seen]
 

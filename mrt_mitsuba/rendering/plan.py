@@ -107,12 +107,15 @@ class Rounds(Pass):
 
     name = "rounds"
     goal: Goal
+    rmse: float | None = None  #: that the target has come to; None until a round has been traced
 
     def __str__(self) -> str:
         goal = self.goal
         if goal.target is None:
             return f"rounds of rays, {goal.most} a pixel on average, where the variance is"
-        error = f"{goal.target} of the mean luminance" if goal.target.relative else str(goal.target)
+        error = str(goal.target)
+        if goal.target.relative:
+            error += " of the mean luminance" + ("" if self.rmse is None else f", {self.rmse:.3g}")
         seconds = "" if goal.seconds is None else f" or {goal.seconds:g} s"
         return f"rounds of rays, to an error of {error}, at most {goal.most} a pixel{seconds}"
 
@@ -168,6 +171,11 @@ class Plan:
     def blur(self) -> Blur | None:
         """The pass that gives the picture depth of field, if any."""
         return next((step for step in self.passes if isinstance(step, Blur)), None)
+
+    def resolved(self, rmse: float | None) -> Plan:
+        """The plan with the RMSE that its target has come to."""
+        steps = (replace(step, rmse=rmse) if isinstance(step, Rounds) else step for step in self.passes)
+        return replace(self, passes=tuple(steps))
 
     def __str__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]

@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from mrt_mitsuba.errors import MrtWarning
 from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, Round, RoundPicture
 from mrt_mitsuba.rendering.progress import Advance
+from mrt_mitsuba.target import Goal, Target
 
 if TYPE_CHECKING:
     from mrt_mitsuba.rendering.noise import Halves
@@ -33,27 +35,18 @@ Stage = Callable[[str, int, str], AbstractContextManager[Advance]]
 
 
 def run_rounds(
-    picture: Halves,
-    stage: Stage,
-    *,
-    rays: int,
-    target: float | None = None,
-    seconds: float | None = None,
-    on_round: OnRound | None = None,
+    picture: Halves, stage: Stage, goal: Goal, on_round: OnRound | None = None
 ) -> tuple[list[Round], ErrorEstimate]:
     """Trace rounds until a goal is reached; return what each has found, and the error in the end.
 
-    Warns of a target that is not reached, and of an error that cannot be trusted.
-
-    Args:
-        rays: mean of a pixel, to spend, or at most with a target.
-        target: RMSE, linear.
-        seconds: to spend at most.
-        on_round: called after each round; False stops.
+    Warns of a target that is not reached, and of an error that cannot be trusted. ``on_round`` is called
+    after each round, and stops by returning False.
     """
     start, done, spent, pixels = time.perf_counter(), list[Round](), 0, picture.film.pixels
-    least, doubled = min(rays, picture.least, LEAST / pixels) if target else 0, 0
-    chosen = picture.first()
+    rays, seconds, asked = goal.most, goal.seconds, goal.target
+    target = None if asked is None or asked.relative else asked.value
+    least, doubled = min(rays, picture.least, LEAST / pixels) if asked else 0, 0
+    chosen, black, stopped = picture.first(), "", False
     while cost := picture.cost(chosen):
         spent += cost
         with stage("rounds", cost, _message(done, target, cost / pixels)) as advance:
@@ -61,12 +54,19 @@ def run_rounds(
         rmse = math.sqrt(float(picture.squares().mean()))
         now = Round(time.perf_counter() - start, spent / pixels, rmse)
         done.append(now)
+        if asked and asked.relative and len(done) == 1:
+            target = asked.rmse(picture.luminance())
+            black = "" if target else _black(asked)
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
         if on_round is not None:
-            image, deviation, samples = (np.array(values, np.float32) for values in picture.maps())  # copies
+            with np.errstate(over="ignore"):  # of errors beyond float32
+                image, deviation, samples = (np.array(values, np.float32) for values in picture.maps())
             shown = RoundPicture(now.seconds, now.spp, now.rmse, image, deviation, samples, target)
-            if on_round(shown) is False:
-                return done, picture.error()
+            stopped = on_round(shown) is False
+            if stopped:
+                break
+        if black:
+            break
         most = min(rays, GROWTH * now.spp)
         if seconds is not None:
             most = min(most, now.spp * seconds / now.seconds)
@@ -77,13 +77,14 @@ def run_rounds(
         if now.spp < 0.9 * least:  # shares are rounded
             chosen = picture.next(min(most, least), rays, None, EVEN)
         elif target is None or forecast > target:
-            chosen = picture.next(most, rays, target and MARGIN * target)
+            chosen = picture.next(most, rays, target and MARGIN * max(target, 1e-100))
         elif tail > DOUBTFUL and doubled < MORE:
             chosen, doubled = picture.next(min(most, 2 * now.spp), rays, None), doubled + 1
         else:
             break
-    error = picture.error()
-    found = [picture.unfit(), _doubt(error), _missed(target, rays, seconds, now, error)]
+    error = replace(picture.error(), target=target)
+    missed = "" if stopped or black else _missed(goal, now, error)
+    found = [picture.unfit(), black, _doubt(error), missed]
     if any(found):
         warnings.warn("; ".join(filter(None, found)), MrtWarning, stacklevel=7)  # the caller of render
     return done, error
@@ -100,19 +101,29 @@ def _doubt(error: ErrorEstimate) -> str:
     )
 
 
-def _missed(target: float | None, rays: int, seconds: float | None, now: Round, error: ErrorEstimate) -> str:
+def _black(target: Target) -> str:
+    """What to say of a share of the luminance of a black picture."""
+    return (
+        f"target={target}: the picture is black, as far as pilot rays have met it, so that a share of its "
+        "mean luminance is 0; the render ends. Give a number, such as target=0.01"
+    )
+
+
+def _missed(goal: Goal, now: Round, error: ErrorEstimate) -> str:
     """Return why an error is larger than was asked for; nothing if it is not."""
-    if target is None or now.rmse <= target:
+    target, rays, seconds = error.target, goal.most, goal.seconds
+    if goal.target is None or target is None or now.rmse <= target:
         return ""
+    asked = f"target={goal.target}, which is {target:.3g}," if goal.target.relative else f"target={target:g}"
     spent = f"an error of {now.rmse:.3g}, after {now.spp:.1f} rays a pixel and {now.seconds:.1f} s"
     late = seconds is not None and seconds < LEAST_GROWTH * now.seconds
     if late or now.spp * LEAST_GROWTH > rays:
         limit = f"maxseconds={seconds:g}" if late else f"maxspp={rays}"
-        return f"target={target:g} is not reached: {limit} ends the render at {spent}"
+        return f"{asked} is not reached: {limit} ends the render at {spent}"
     if error.low <= target:
         return ""
     return (
-        f"target={target:g} is missed by {spent}: rays that are not in the picture decide when to stop, and "
+        f"{asked} is missed by {spent}: rays that are not in the picture decide when to stop, and "
         "met less noise. A smaller target helps"
     )
 

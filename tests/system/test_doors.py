@@ -97,8 +97,9 @@ def test_a_plan_holds_what_the_integrator_states_and_the_caller_asks(stated, opt
 
 
 def test_the_plan_says_what_a_relative_target_is_a_share_of():
-    plan = str(mrt.render(box(), integrator="path", target="900%").plan)
-    assert "to an error of 900% of the mean luminance, at most 4096 a pixel" in plan
+    result = mrt.render(box(), integrator="path", target="900%")
+    reached = f"{result.error.target:.3g}"
+    assert f"to an error of 900% of the mean luminance, {reached}, at most 4096 a pixel" in str(result.plan)
 
 
 def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):

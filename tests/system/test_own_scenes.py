@@ -245,6 +245,45 @@ def test_limits_of_rays_and_seconds():
     assert mrt.render(scene, spp=4).error is None
 
 
+def test_a_relative_target_is_a_share_of_the_mean_luminance(capsys, tmp_path):
+    scene = _load("area_light")
+    luminance = mrt.render(scene, spp=256, aa=1, aamode="none").image.mean((0, 1)) @ (0.2127, 0.7152, 0.0722)
+    result = mrt.render(scene, target="5%")
+    target = result.error.target
+    assert target == pytest.approx(0.05 * luminance, rel=0.1)
+    assert result.rounds[-1].rmse < 1.1 * target
+    assert f"5% of the mean luminance, {target:.3g}" in str(result.plan)
+    assert result.header()["mrt:error"]["target"] == target
+    assert_array_equal(result.image, mrt.render(scene, target=target).image)
+    with pytest.warns(mrt.MrtWarning, match=r"target=0.01%, which is [0-9.e-]+, is not reached: maxspp=20"):
+        mrt.render(scene, target="0.01%", maxspp=20)
+    inside = {"type": "mrt_adaptive", "target": "5%", "nested": {"type": "path", "max_depth": 4}}
+    found = np.array(mi.render(scene, integrator=mi.load_dict(inside)))
+    assert_array_equal(found[..., :3], result.image)
+
+
+def test_a_share_of_a_black_picture_ends_with_one_warning():
+    black = {"type": "scene", "camera": sensor([0, 0, 5], [0, 0, 0]), "ball": {"type": "sphere"}}
+    with pytest.warns(mrt.MrtWarning, match="target=2%: the picture is black") as warned:
+        result = mrt.render(black, integrator="path", target="2%", width=WIDTH, height=HEIGHT)
+    assert len(warned) == 1
+    assert len(result.rounds) == 1
+    assert not result.image.any()
+
+
+def test_a_target_beyond_the_smallest_numbers_spends_all_rays():
+    with pytest.warns(mrt.MrtWarning, match="target=1e-170 is not reached") as warned:
+        assert mrt.render(_load("area_light"), target=1e-170, maxspp=20).rounds[-1].spp < 22
+    assert len(warned) == 1
+
+
+def test_who_stops_a_render_still_hears_of_radiance_that_has_no_square():
+    scene = mi.cornell_box()
+    scene["light"]["emitter"]["radiance"] = {"type": "rgb", "value": 1e30}
+    with pytest.warns(mrt.MrtWarning, match="are left out of the error"):
+        mrt.render(scene, target=1e-4, width=WIDTH, height=HEIGHT, on_round=lambda now: False)
+
+
 def _assert_true(result: mrt.Result, truth: np.ndarray) -> None:
     """An interval of 95 %, half as wide again: other machines round, and so trace, other rays."""
     assert result.error.low / 1.5 <= _rmse(result.image, truth) <= 1.5 * result.error.high

@@ -17,6 +17,7 @@ from mrt_mitsuba.output.error import DOUBTFUL, tail_shape
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.noise import Halves
 from mrt_mitsuba.rendering.rounds import run_rounds
+from mrt_mitsuba.target import Goal, Target
 
 SIDE = 16
 PIXELS = SIDE**2
@@ -58,10 +59,11 @@ class Draws:
         return SimpleNamespace(sums=sums, weights=weights, rays=rays, total=total, square=square, peak=peak)
 
 
-def _render(exposer: Draws, seed: int = 0, **goal: Any) -> Any:
+def _render(exposer: Draws, seed: int = 0, target: Any = None, rays: int = 64, on_round: Any = None) -> Any:
     """Return what a render of drawn values has."""
     halves = Halves(exposer, seed)  # type: ignore[arg-type]
-    rounds, error = run_rounds(halves, lambda *_: nullcontext(lambda rays: None), **{"rays": 64} | goal)
+    aim = Goal(None if target is None else Target.of(target), rays)
+    rounds, error = run_rounds(halves, lambda *_: nullcontext(lambda rays: None), aim, on_round)
     image, error_map, samples = halves.maps()
     return SimpleNamespace(
         rounds=rounds, error=error, rays=halves.rays, image=image, map=error_map, samples=samples
