@@ -16,7 +16,7 @@ import numpy as np
 from mrt_mitsuba.errors import MrtWarning
 from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, Round, RoundPicture
 from mrt_mitsuba.rendering.progress import Advance
-from mrt_mitsuba.target import Goal, Target
+from mrt_mitsuba.target import Goal
 
 if TYPE_CHECKING:
     from mrt_mitsuba.rendering.noise import Halves
@@ -44,9 +44,9 @@ def run_rounds(
     """
     start, done, spent, pixels = time.perf_counter(), list[Round](), 0, picture.film.pixels
     rays, seconds, asked = goal.most, goal.seconds, goal.target
-    target = None if asked is None or asked.relative else asked.value
+    target: float | None = None
     least, doubled = min(rays, picture.least, LEAST / pixels) if asked else 0, 0
-    chosen, black, stopped = picture.first(), "", False
+    chosen, stopped = picture.first(), False
     while cost := picture.cost(chosen):
         spent += cost
         with stage("rounds", cost, _message(done, target, cost / pixels)) as advance:
@@ -54,18 +54,11 @@ def run_rounds(
         rmse = math.sqrt(float(picture.squares().mean()))
         now = Round(time.perf_counter() - start, spent / pixels, rmse)
         done.append(now)
-        if asked and asked.relative and len(done) == 1:
+        if asked and target is None:
             target = asked.rmse(picture.luminance())
-            black = "" if target else _black(asked)
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
-        if on_round is not None:
-            with np.errstate(over="ignore"):  # of errors beyond float32
-                image, deviation, samples = (np.array(values, np.float32) for values in picture.maps())
-            shown = RoundPicture(now.seconds, now.spp, now.rmse, image, deviation, samples, target)
-            stopped = on_round(shown) is False
-            if stopped:
-                break
-        if black:
+        stopped = on_round is not None and on_round(_shown(now, picture, target)) is False
+        if stopped or target == 0:
             break
         most = min(rays, GROWTH * now.spp)
         if seconds is not None:
@@ -83,11 +76,17 @@ def run_rounds(
         else:
             break
     error = replace(picture.error(), target=target)
-    missed = "" if stopped or black else _missed(goal, now, error)
-    found = [picture.unfit(), black, _doubt(error), missed]
+    found = [picture.unfit(), _doubt(error), "" if stopped else _missed(goal, now, error)]
     if any(found):
         warnings.warn("; ".join(filter(None, found)), MrtWarning, stacklevel=7)  # the caller of render
     return done, error
+
+
+def _shown(now: Round, picture: Halves, target: float | None) -> RoundPicture:
+    """A round with copies of its picture, its error and its rays."""
+    with np.errstate(over="ignore"):  # of errors beyond float32
+        image, deviation, samples = (np.array(values, np.float32) for values in picture.maps())
+    return RoundPicture(now.seconds, now.spp, now.rmse, image, deviation, samples, target)
 
 
 def _doubt(error: ErrorEstimate) -> str:
@@ -101,17 +100,14 @@ def _doubt(error: ErrorEstimate) -> str:
     )
 
 
-def _black(target: Target) -> str:
-    """What to say of a share of the luminance of a black picture."""
-    return (
-        f"target={target}: the picture is black, as far as pilot rays have met it, so that a share of its "
-        "mean luminance is 0; the render ends. Give a number, such as target=0.01"
-    )
-
-
 def _missed(goal: Goal, now: Round, error: ErrorEstimate) -> str:
     """Return why an error is larger than was asked for; nothing if it is not."""
     target, rays, seconds = error.target, goal.most, goal.seconds
+    if target == 0:
+        return (
+            f"target={goal.target}: the picture is black, as far as pilot rays have met it, and so a share "
+            "of its mean luminance is 0; the render ends. Give a number, such as target=0.01"
+        )
     if goal.target is None or target is None or now.rmse <= target:
         return ""
     asked = f"target={goal.target}, which is {target:.3g}," if goal.target.relative else f"target={target:g}"
