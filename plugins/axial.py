@@ -40,20 +40,19 @@ class AxialMesh(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
         if props.get("face_normals", False):
             raise ParameterError(f'{name}: "face_normals" is not accepted; its side is round')
         self.placement = Placement(props)
-        self.unit = vertices, faces = KINDS[self.kind].mesh(segments(props, 256))
+        self.unit = KINDS[self.kind].mesh(segments(props, 256))
+        vertices, faces = self.unit
         #: the unit frame in world space, in double precision (see ``intersect``)
         self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)
         buffers = {"has_vertex_normals": True, "has_vertex_texcoords": True}
         mi.Mesh.__init__(self, name, len(vertices), len(faces), props, **buffers)
         uvs = vertices[:, 6:].astype(np.float32).ravel()
         write_buffers(self, vertex_texcoords=uvs, **self.quadrics().stand_in(self.unit))
-        self.parameters = {
-            **dict(zip(self.ends, map(mi.Point3f, ends), strict=True)),
-            "radius": updatable(radius),
-        }
+        parameters = dict(zip(self.ends, map(mi.Point3f, ends), strict=True))
+        self.parameters = {**parameters, "radius": updatable(radius)}
         keep_apart(self, name, len(faces))
 
-    def _frame_of(self, p0: Any, p1: Any, radius: Any) -> Frame:
+    def _frame_of(self, p0, p1, radius) -> Frame:
         return self.placement(KINDS[self.kind].frame(p0, p1, radius))
 
     def quadrics(self) -> QuadricTable:
@@ -63,7 +62,7 @@ class AxialMesh(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
         values = list(self.parameters.values())
         return self._frame_of(*values) if dr.grad_enabled(values) else None
 
-    def looked_at(self) -> tuple[Sequence[Any], Sequence[Any], Sequence[Any]]:
+    def looked_at(self) -> tuple[list, list, list]:
         """Return what a snapshot compares in place of all attributes: plain values, objects, and arrays."""
         arrays = [*self.parameters.values(), self.vertex_positions_buffer(), self.faces_buffer()]
         return [self.kind], [self.exact_frame, self.placement], arrays
@@ -87,7 +86,9 @@ class AxialMesh(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
     def _follow(self, frame: Frame) -> None:
         """Write positions and normals anew, differentiably with respect to what ``frame`` is made of."""
         frame = Frame(*map(mi.Vector3f, vars(frame).values()))
-        points, gradients = (mi.Vector3f(x.T) for x in (self.unit[0][:, :3], self.unit[0][:, 3:6]))
+        vertices, _ = self.unit
+        points = mi.Vector3f(vertices[:, :3].T)
+        gradients = mi.Vector3f(vertices[:, 3:6].T)
         positions = dr.ravel(frame.origin + frame.to_world(points))
         normals = dr.ravel(dr.normalize(frame.gradient(gradients)))
         write_buffers(self, vertex_positions=positions, vertex_normals=normals)
@@ -137,7 +138,8 @@ class MrtCone(AxialMesh):
     Nearest stock plugin: ``linearcurve``, whose segments of varying radius have round ends.
     """
 
-    kind, ends = "cone", ("apex", "base_center")
+    kind = "cone"
+    ends = ("apex", "base_center")
 
 
 class MrtCylinder(AxialMesh):
@@ -175,9 +177,10 @@ class MrtCylinder(AxialMesh):
     Nearest stock plugin: ``cylinder``, which is open.
     """
 
-    kind, ends = "cylinder", ("p0", "p1")
+    kind = "cylinder"
+    ends = ("p0", "p1")
 
 
-def vector64(v: Any) -> Any:
+def vector64(v):
     """Return three numbers, or a point or vector of one entry, in double precision."""
     return dr.scalar.Array3f64([first(c) for c in v])

@@ -106,7 +106,8 @@ class MrtBSDF(mi.BSDF):
             if any(varies(self.parameters.get(name)) for name in (lobe.reflectance, *lobe.depends_on)):
                 flags |= mi.BSDFFlags.SpatiallyVarying
             components.append(flags)
-        self.m_components, self.m_flags = components, reduce(or_, components)
+        self.m_components = components
+        self.m_flags = reduce(or_, components)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         for name, parameter in self.parameters.items():
@@ -115,7 +116,7 @@ class MrtBSDF(mi.BSDF):
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         self._update()
 
-    def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:
+    def _read(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return a parameter at a surface point."""
         parameter = self.parameters[name]
         if isinstance(parameter, mi.Texture):
@@ -147,12 +148,14 @@ class MrtBSDF(mi.BSDF):
     def eval(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
     ) -> mi.Spectrum:
-        return mi.depolarizer(self.lobes(si, active).value(ctx, Pair.above(si.wi, wo, active)))
+        pair = Pair.above(si.wi, wo, active)
+        return mi.depolarizer(self.lobes(si, active).value(ctx, pair))
 
     def pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
     ) -> mi.Float:
-        return self.lobes(si, active).density(ctx, Pair.above(si.wi, wo, active))
+        pair = Pair.above(si.wi, wo, active)
+        return self.lobes(si, active).density(ctx, pair)
 
     def sample(
         self,
@@ -166,10 +169,14 @@ class MrtBSDF(mi.BSDF):
         wo, pair, component = lobes.sample(ctx, sample1, sample2, active)
         pdf = lobes.density(ctx, pair)
         drawn = pdf > 0
-        weight = dr.select(drawn, lobes.value(ctx, pair) / dr.select(drawn, dr.detach(pdf), 1), 0)
+        divisor = dr.select(drawn, dr.detach(pdf), 1)
+        weight = dr.select(drawn, lobes.value(ctx, pair) / divisor, 0)
         bs = mi.BSDFSample3f()
-        bs.wo, bs.pdf, bs.eta = wo, pdf, mi.Float(1)
-        bs.sampled_component, bs.sampled_type = component, mi.UInt32(0)
+        bs.wo = wo
+        bs.pdf = pdf
+        bs.eta = mi.Float(1)
+        bs.sampled_component = component
+        bs.sampled_type = mi.UInt32(0)
         for k, lobe in enumerate(LOBES):
             kind = mi.UInt32(+getattr(mi.BSDFFlags, lobe.flag))
             bs.sampled_type = dr.select(component == k, kind, bs.sampled_type)
@@ -197,7 +204,8 @@ class MrtBSDF(mi.BSDF):
 
     def mirror_bound(self) -> Mirror:
         """Return upper bounds of ``mirror_reflectance``, and ``int_ior``; inf for what varies."""
-        bound, int_ior = largest(self.parameters["specular_reflectance"]), self.parameters["int_ior"]
+        bound = largest(self.parameters["specular_reflectance"])
+        int_ior = self.parameters["int_ior"]
         indices = self.parameters["ext_ior"], int_ior
         f0 = 1.0
         if "f0" in self.parameters:

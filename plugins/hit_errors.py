@@ -12,8 +12,6 @@ With u = 2⁻²⁴, every bound has the form δ = k u (size of the numbers that 
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -65,22 +63,24 @@ def _sizes_across(corners: np.ndarray) -> list[float]:
     """Return w and c of triangles."""
     edges = np.stack([corners[:, k] - corners[:, k - 1] for k in range(3)], axis=1)  # [n, 3, 3]
     width = np.abs(edges).max(axis=1, initial=0.0)  # [n, 3]
-    a, b = edges[:, 0], edges[:, 1]
+    a = edges[:, 0]
+    b = edges[:, 1]
     normal = np.linalg.norm(np.cross(a, b), axis=1)
     # What the components of a cross product lose, by the extents that they are multiplied with
-    lost = sum(
-        width[:, i] * (np.abs(a[:, i - 2] * b[:, i - 1]) + np.abs(a[:, i - 1] * b[:, i - 2]))
-        for i in range(3)
-    )
+    lost = 0
+    for i in range(3):
+        products = np.abs(a[:, i - 2] * b[:, i - 1]) + np.abs(a[:, i - 1] * b[:, i - 2])
+        lost = lost + width[:, i] * products
     condition = np.divide(lost, normal, out=np.zeros_like(lost), where=normal > 0)
     width = width.max(axis=0, initial=0.0)
     return [*width.tolist(), float(condition.max(initial=0.0) + LEAST * width.max())]
 
 
-def _flat_triangles(shape: Any) -> np.ndarray | None:
+def _flat_triangles(shape: mi.Shape) -> np.ndarray | None:
     """Return the corners [n, 3, 3] of a mesh's triangles, or of the two of a rectangle; None for others."""
     if shape.shape_type() == +mi.ShapeType.Rectangle:
         matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
-        square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) @ matrix[:3, :3].T + matrix[:3, 3]
-        return square[[(0, 1, 2), (0, 2, 3)]]
+        square = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+        corners = square @ matrix[:3, :3].T + matrix[:3, 3]
+        return corners[[(0, 1, 2), (0, 2, 3)]]
     return triangles(shape) if shape.is_mesh() else None

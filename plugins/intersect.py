@@ -8,7 +8,6 @@ selected as a whole.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,8 +45,10 @@ def intersect_sphere(o, d, center, radius):
     q = b + dr.select(ahead, root, -root)
     distance = dr.norm(f)
     c = (distance - radius) * (distance + radius)
-    small, large = c / dr.select(q == 0, 1, q), q / a
-    near, far = dr.select(ahead, small, large), dr.select(ahead, large, small)
+    small = c / dr.select(q == 0, 1, q)
+    large = q / a
+    near = dr.select(ahead, small, large)
+    far = dr.select(ahead, large, small)
     t = dr.select(near > 0, near, far)
     return dr.select(meets & (t > 0), t, dr.inf)
 
@@ -78,31 +79,36 @@ class Frame:
     y: Any
     z: Any
 
-    def point(self, p: Any) -> Any:
+    def point(self, p):
         """Return a world-space point in the unit frame."""
         return self.vector(p - self.origin)
 
-    def vector(self, v: Any) -> Any:
+    def vector(self, v):
         """Return a world-space vector in the unit frame."""
         return type(v)([dr.dot(self.x, v), dr.dot(self.y, v), dr.dot(self.z, v)])
 
-    def to_world(self, v: Any) -> Any:
+    def to_world(self, v):
         """Return the world-space vector whose unit-frame components are ``v``: by the inverse matrix."""
         # Its columns are cross products of the rows
-        across = [_cross(self.y, self.z), _cross(self.z, self.x), _cross(self.x, self.y)]
-        inverse_volume = 1 / dr.dot(self.x, across[0])
-        return (across[0] * v.x + across[1] * v.y + across[2] * v.z) * inverse_volume
+        column_x = _cross(self.y, self.z)
+        column_y = _cross(self.z, self.x)
+        column_z = _cross(self.x, self.y)
+        inverse_volume = 1 / dr.dot(self.x, column_x)
+        return (column_x * v.x + column_y * v.y + column_z * v.z) * inverse_volume
 
-    def gradient(self, g: Any) -> Any:
+    def gradient(self, g):
         """Return the world-space gradient of a function, given that in the unit frame: by the transpose."""
         return self.x * g.x + self.y * g.y + self.z * g.z
 
 
-def _cross(a: Any, b: Any) -> Any:
-    return type(a)([a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x])
+def _cross(a, b):
+    x = a.y * b.z - a.z * b.y
+    y = a.z * b.x - a.x * b.z
+    z = a.x * b.y - a.y * b.x
+    return type(a)([x, y, z])
 
 
-def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> tuple[Any, Any]:
+def intersect_cone(o, d, frame: Frame, *, capped: bool = True):
     """Return the first hit at t > 0 of a ray with a cone: lateral surface and, if ``capped``, base disc.
 
     Seen from inside, the far side is met. With p the point of the line nearest to the apex, u its unit
@@ -116,13 +122,16 @@ def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> tupl
     a = (rho - dr.abs(u.z)) * (rho + dr.abs(u.z))
     half_b = -2 * p.z * u.z
     c = (r - dr.abs(p.z)) * (r + dr.abs(p.z))
-    m_x, m_y, m_z = p.y * u.z - p.z * u.y, p.z * u.x - p.x * u.z, dr.abs(p.x * u.y - p.y * u.x)
+    m_x = p.y * u.z - p.z * u.y
+    m_y = p.z * u.x - p.x * u.z
+    m_z = dr.abs(p.x * u.y - p.y * u.x)
     m_xy = dr.sqrt(dr.square(m_x) + dr.square(m_y))
     discriminant = (m_xy - m_z) * (m_xy + m_z)
     first, second = _roots(a, half_b, c, discriminant)
     # Steeper than the side: the line is inside each half of the double cone once, up to or from infinity.
     # Shallower: both roots are on the half on whose side of the apex p is
-    steep, down = a <= 0, u.z > 0
+    steep = a <= 0
+    down = u.z > 0
     near = dr.select(steep, dr.select(down, second, -dr.inf), first)
     far = dr.select(steep, dr.select(down, dr.inf, first), second)
     inside = steep | ((discriminant >= 0) & (p.z > 0))
@@ -134,12 +143,12 @@ def intersect_cone(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> tupl
     inside = inside & dr.select(level, p.z <= 1, True)
     near_part = dr.select(enter_base > near, BASE, LATERAL)
     far_part = dr.select(leave_base < far, BASE, LATERAL)
-    return _first_boundary(
-        t_of, inside, dr.maximum(near, enter_base), near_part, dr.minimum(far, leave_base), far_part, capped
-    )
+    near = dr.maximum(near, enter_base)
+    far = dr.minimum(far, leave_base)
+    return _first_boundary(t_of, inside, near, near_part, far, far_part, capped)
 
 
-def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> tuple[Any, Any]:
+def intersect_cylinder(o, d, frame: Frame, *, capped: bool = True):
     """Return the first hit at t > 0 of a ray with a cylinder: lateral surface and, if ``capped``, two discs.
 
     As ``intersect_cone``, for the form a.x b.x + a.y b.y: the discriminant is ρ² − (p × u).z², ρ² = u.x² +
@@ -152,54 +161,61 @@ def intersect_cylinder(o: Any, d: Any, frame: Frame, *, capped: bool = True) -> 
     discriminant = (rho - moment) * (rho + moment)
     first, second = _roots(dr.square(rho), p.x * u.x + p.y * u.y, (r - 1) * (r + 1), discriminant)
     along = rho == 0
-    near, far = dr.select(along, -dr.inf, first), dr.select(along, dr.inf, second)
+    near = dr.select(along, -dr.inf, first)
+    far = dr.select(along, dr.inf, second)
     inside = dr.select(along, r <= 1, discriminant >= 0)
     level = u.z == 0
     inside = inside & dr.select(level, (p.z >= 0) & (p.z <= 1), True)
-    to_top, to_base = -p.z / off_zero(u.z), (1 - p.z) / off_zero(u.z)
+    to_top = -p.z / off_zero(u.z)
+    to_base = (1 - p.z) / off_zero(u.z)
     down = u.z > 0
     enter = dr.select(level, -dr.inf, dr.minimum(to_top, to_base))
     leave = dr.select(level, dr.inf, dr.maximum(to_top, to_base))
     near_part = dr.select(enter > near, dr.select(down, TOP, BASE), LATERAL)
     far_part = dr.select(leave < far, dr.select(down, BASE, TOP), LATERAL)
-    return _first_boundary(
-        t_of, inside, dr.maximum(near, enter), near_part, dr.minimum(far, leave), far_part, capped
-    )
+    near = dr.maximum(near, enter)
+    far = dr.minimum(far, leave)
+    return _first_boundary(t_of, inside, near, near_part, far, far_part, capped)
 
 
-def _line(o: Any, d: Any, frame: Frame) -> tuple[Any, Any, Callable[[Any], Any]]:
+def _line(o, d, frame: Frame):
     """Return a ray's line in the unit frame: p, u of s ↦ p + s u with |u| = 1, p · u = 0; and t of s."""
-    o, d = frame.point(o), frame.vector(d)
+    o = frame.point(o)
+    d = frame.vector(d)
     length = dr.norm(d)
     u = d / length
     along = dr.dot(o, u)
     p = type(d)(o) - u * along
     rest = dr.dot(p, u)  # from far away, the rounding of the first step is not small against the shape
-    return p - u * rest, u, lambda s: (s - (along + rest)) / length
+
+    def t_of(s):
+        return (s - (along + rest)) / length
+
+    return p - u * rest, u, t_of
 
 
-def off_zero(x: Any, least: float = _TINY) -> Any:
+def off_zero(x, least=_TINY):
     """Return ``x``, or ``least`` with the same sign where it is smaller."""
     return dr.select(dr.abs(x) >= least, x, dr.select(x < 0, -least, least))
 
 
-def _roots(a: Any, half_b: Any, c: Any, discriminant: Any) -> tuple[Any, Any]:
+def _roots(a, half_b, c, discriminant):
     """Return the roots of a s² + 2 half_b s + c in ascending order; where a vanishes, one of them is huge.
 
     Source: the cancellation-free form, e.g. Press et al., Numerical Recipes, §5.6.
     """
     root = dr.sqrt(dr.maximum(discriminant, 0))
     q = dr.select(half_b >= 0, -half_b - root, root - half_b)
-    one, other = q / dr.select(a == 0, -_TINY, a), c / off_zero(q)
+    one = q / dr.select(a == 0, -_TINY, a)
+    other = c / off_zero(q)
     return dr.minimum(one, other), dr.maximum(one, other)
 
 
-def _first_boundary(
-    t_of: Callable, inside: Any, near: Any, near_part: Any, far: Any, far_part: Any, capped: bool
-) -> tuple[Any, Any]:
+def _first_boundary(t_of, inside, near, near_part, far, far_part, capped: bool):
     """Return the first end at t > 0 of the interval [near, far] of s, and what is hit there."""
     inside = inside & (near <= far)
-    near_t, far_t = t_of(near), t_of(far)
+    near_t = t_of(near)
+    far_t = t_of(far)
     if not capped:
         near_t = dr.select(near_part == LATERAL, near_t, -dr.inf)
         far_t = dr.select(far_part == LATERAL, far_t, -dr.inf)

@@ -32,13 +32,15 @@ from .variants import ByShape, is_jit
 
 # Roughness below this (zero included) acts as this: the lobe is then narrower than float32 directions can
 # resolve, and D, its inverse square, still fits. Above the other, D is the same everywhere but at the horizon
-ALPHA_MIN, ALPHA_MAX = 1e-8, 1e6
+ALPHA_MIN = 1e-8
+ALPHA_MAX = 1e6
 
 # Directions that are nearer to the horizon count as below it: what divides by their cosines stays in float32
 COS_MIN = 1e-12
 
 # Indices of textures and of updates, whose values are not checked, are brought between these
-IOR_MIN, IOR_MAX = 1e-9, 1e9
+IOR_MIN = 1e-9
+IOR_MAX = 1e9
 
 
 @dataclass
@@ -55,15 +57,17 @@ class Pair:
         cls, wi: mi.Vector3f, wo: mi.Vector3f, active: mi.Bool, tan2_theta_h: mi.Float | None = None
     ) -> Pair:
         """Return the pair with directions from below the surface masked."""
-        above_i, above_o = wi.z > COS_MIN, active & (wo.z > COS_MIN)
+        above_i = wi.z > COS_MIN
+        above_o = active & (wo.z > COS_MIN)
         # Masked lanes get harmless directions: scalar variants raise on 0/0, and no NaN is born. What depends
         # on wi alone is computed once for all wo
         up = mi.Vector3f(0, 0, 1)
-        wi, wo, active = dr.select(above_i, wi, up), dr.select(above_o, wo, up), above_i & above_o
+        wi = dr.select(above_i, wi, up)
+        wo = dr.select(above_o, wo, up)
         tan2 = tan2_theta(wi + wo)
         if tan2_theta_h is not None:
             tan2 = dr.replace_grad(tan2_theta_h, tan2) if dr.grad_enabled(tan2) else tan2_theta_h
-        return cls(wi, wo, tan2, active)
+        return cls(wi, wo, tan2, above_i & above_o)
 
 
 # A lobe has a name, the parameter that scales it with its default, the flag of its component among
@@ -75,7 +79,9 @@ class Pair:
 class Diffuse:
     """Lambert's lobe."""
 
-    name, reflectance, default = "diffuse", "diffuse_reflectance", 0.5
+    name = "diffuse"
+    reflectance = "diffuse_reflectance"
+    default = 0.5
     flag = "DiffuseReflection"
     depends_on: tuple[str, ...] = ()
 
@@ -96,7 +102,9 @@ class Diffuse:
 class Specular:
     """Beckmann's microfacets, each a mirror of Fresnel's reflectance."""
 
-    name, reflectance, default = "specular", "specular_reflectance", 1.0
+    name = "specular"
+    reflectance = "specular_reflectance"
+    default = 1.0
     flag = "GlossyReflection"
     depends_on: tuple[str, ...] = ("alpha", "int_ior", "ext_ior", "f0")
 
@@ -128,8 +136,9 @@ class Specular:
         return at.mirror_reflectance
 
 
+Lobe = Diffuse | Specular
 # In the order of the components of the BSDF
-LOBES: tuple[Any, ...] = (Diffuse(), Specular())
+LOBES: tuple[Lobe, ...] = (Diffuse(), Specular())
 
 # Numbers of materials; their table has up to four columns
 TABLED = ("alpha", "int_ior", "ext_ior")
@@ -160,15 +169,18 @@ class Lobes:
         size = _within(dr.abs(alpha), ALPHA_MIN, ALPHA_MAX)
         return dr.select(alpha < 0, -size, size)
 
-    def fresnel(self, cos_theta: mi.Float, sin2_theta: mi.Float) -> Any:
+    def fresnel(self, cos_theta: mi.Float, sin2_theta: mi.Float) -> mi.UnpolarizedSpectrum:
         """Return F at a microfacet: a float, or a spectrum where ``f0`` was given."""
         if self.form == "unity":
             return mi.Float(1)
-        ext_ior, int_ior = (_within(self.given[name], IOR_MIN, IOR_MAX) for name in ("ext_ior", "int_ior"))
+        ext_ior = _within(self.given["ext_ior"], IOR_MIN, IOR_MAX)
+        int_ior = _within(self.given["int_ior"], IOR_MIN, IOR_MAX)
         if self.form == "dielectric":
             return fresnel_dielectric(cos_theta, ext_ior, int_ior, sin2_theta)
         f0 = self.given.get("f0")
-        return fresnel_schlick(cos_theta, f0_from_ior(ext_ior, int_ior) if f0 is None else f0, sin2_theta)
+        if f0 is None:
+            f0 = f0_from_ior(ext_ior, int_ior)
+        return fresnel_schlick(cos_theta, f0, sin2_theta)
 
     @cached_property
     def mirror_reflectance(self) -> mi.UnpolarizedSpectrum:
@@ -188,7 +200,8 @@ class Lobes:
 
     def density(self, ctx: mi.BSDFContext, pair: Pair) -> mi.Float:
         """Return the density per solid angle with which ``sample`` draws ``pair.wo``."""
-        at, density = self.constant, mi.Float(0)
+        at = self.constant
+        density = mi.Float(0)
         for _, lobe, probability in at._chances(ctx):
             density += probability * lobe.density(at, pair)
         return dr.select(pair.active, density, 0)
@@ -197,22 +210,28 @@ class Lobes:
         self, ctx: mi.BSDFContext, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.Vector3f, Pair, mi.UInt32]:
         """Draw a direction; return it, its pair with ``wi``, and which of ``LOBES`` it was drawn from."""
-        at, above = self.constant, active & (self.wi.z > COS_MIN)
+        at = self.constant
+        above = active & (self.wi.z > COS_MIN)
         up = mi.Vector3f(0, 0, 1)
         wi = dr.select(above, dr.detach(self.wi), up)
-        wo, tan2_theta_h, component = up, mi.Float(0), mi.UInt32(0)
+        wo = up
+        tan2_theta_h = mi.Float(0)
+        component = mi.UInt32(0)
         taken = mi.Float(0)
         for place, (number, lobe, probability) in enumerate(at._chances(ctx)):
-            drawn = lobe.sample(at, wi, sample2)
-            # The first lobe takes what the others leave
-            own = mi.Bool(True) if place == 0 else (sample1 >= taken) & (sample1 < taken + probability)
-            taken += 0 if place == 0 else probability
-            wo, tan2_theta_h = dr.select(own, drawn[0], wo), dr.select(own, drawn[1], tan2_theta_h)
+            direction, tan2 = lobe.sample(at, wi, sample2)
+            own = mi.Bool(True)  # the first lobe takes what the others leave
+            if place > 0:
+                own = (sample1 >= taken) & (sample1 < taken + probability)
+                taken += probability
+            wo = dr.select(own, direction, wo)
+            tan2_theta_h = dr.select(own, tan2, tan2_theta_h)
             component = dr.select(own, mi.UInt32(number), component)
-        wo, tan2_theta_h = dr.detach(wo), dr.detach(tan2_theta_h)
+        wo = dr.detach(wo)
+        tan2_theta_h = dr.detach(tan2_theta_h)
         return wo, Pair.above(dr.select(above, self.wi, up), wo, above, tan2_theta_h), component
 
-    def _chances(self, ctx: mi.BSDFContext) -> list[tuple[int, Any, mi.Float]]:
+    def _chances(self, ctx: mi.BSDFContext) -> list[tuple[int, Lobe, mi.Float]]:
         """Return the enabled lobes, and how likely each is drawn from: after their reflectances."""
         lobes = _enabled(ctx)
         if len(lobes) < 2:
@@ -220,16 +239,18 @@ class Lobes:
         weights = [dr.abs(dr.mean(lobe.albedo(self))) for _, lobe in lobes]
         total = sum(weights)
         known = total > 0
-        shares = [dr.select(known, w / dr.select(known, total, 1), 1 / len(lobes)) for w in weights[1:]]
-        return [(k, lobe, p) for (k, lobe), p in zip(lobes, [1 - sum(shares), *shares], strict=True)]
+        divisor = dr.select(known, total, 1)
+        shares = [dr.select(known, weight / divisor, 1 / len(lobes)) for weight in weights[1:]]
+        shares.insert(0, 1 - sum(shares))
+        return [(k, lobe, share) for (k, lobe), share in zip(lobes, shares, strict=True)]
 
 
-def _enabled(ctx: mi.BSDFContext) -> list[tuple[int, Any]]:
+def _enabled(ctx: mi.BSDFContext) -> list[tuple[int, Lobe]]:
     """Return the lobes that take part, with their places in ``LOBES``."""
     return [(k, x) for k, x in enumerate(LOBES) if ctx.is_enabled(getattr(mi.BSDFFlags, x.flag), k)]
 
 
-def _within(x: Any, least: float, most: float) -> Any:
+def _within(x: mi.Float, least: float, most: float) -> mi.Float:
     """Return ``x`` between two limits; NaN gives the lower one."""
     return dr.select(x >= least, dr.minimum(x, most), least)
 
@@ -263,9 +284,10 @@ class MaterialTable:
     def lobes(self, si: mi.SurfaceInteraction3f) -> Lobes:
         """Return the lobes at a surface point."""
         # One mask for all lights, or they would be looked up for each
-        numbers, *colors = (self.by_shape(si, mi.Bool(True), part) for part in range(1 + len(LOBES)))
+        numbers = self.by_shape(si, mi.Bool(True))
         channels = dr.size_v(mi.UnpolarizedSpectrum)
         given = dict(zip(TABLED, numbers, strict=False))
-        for lobe, color in zip(LOBES, colors, strict=True):
+        for part, lobe in enumerate(LOBES, start=1):
+            color = self.by_shape(si, mi.Bool(True), part)
             given[lobe.reflectance] = mi.UnpolarizedSpectrum(list(color)[:channels])
         return Lobes(self.fresnel, given, si.wi)

@@ -34,12 +34,18 @@ class MrtMesh(mi.Mesh):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        positions, faces = _array(props, "positions", 3), _array(props, "faces", 3)
-        given = _given_extras(props)
-        extras = {name: _array(props, name, *_EXTRAS[name])[:, : _EXTRAS[name][0]] for name in given}
+        positions = _array(props, "positions", 3)
+        faces = _array(props, "faces", 3)
+        extras = {
+            name: _array(props, name, *widths)[:, : widths[0]]
+            for name, widths in _EXTRAS.items()
+            if name in props
+        }
+        if "normals" in extras and props.get("face_normals", False):
+            raise ParameterError('mrt_mesh: give "normals" or "face_normals", not both')
         if (faces % 1).any():
             raise ParameterError('mrt_mesh: "faces" holds a number that is not whole')
-        sizes = count, _ = len(positions), len(faces)
+        count = len(positions)
         wrong = faces[(faces < 0) | (faces >= count)]
         if len(wrong):
             raise ParameterError(f'mrt_mesh: "faces" holds {wrong[0]}, but there are {count} positions')
@@ -56,21 +62,14 @@ class MrtMesh(mi.Mesh):
             lengths = np.linalg.norm(extras["normals"], axis=1, keepdims=True)
             extras["normals"] = extras["normals"] / np.where(lengths == 0, 1, lengths)
         buffers = {f"has_vertex_{name}": name in extras for name in _EXTRAS}
-        mi.Mesh.__init__(self, "mrt_mesh", *sizes, props, **buffers)
+        mi.Mesh.__init__(self, "mrt_mesh", count, len(faces), props, **buffers)
         arrays = {"positions": positions, **extras}
         flat = {f"vertex_{name}": array.astype(np.float32).ravel() for name, array in arrays.items()}
         write_buffers(self, **flat, faces=faces.astype(np.uint32).ravel())
-        self.content = f"positions={len(positions)}, faces={len(faces)}"
+        self.content = f"positions={count}, faces={len(faces)}"
 
     def to_string(self) -> str:
         return f"MrtMesh[{self.content}]"
-
-
-def _given_extras(props: mi.Properties) -> list[str]:
-    given = [name for name in _EXTRAS if name in props]
-    if "normals" in given and props.get("face_normals", False):
-        raise ParameterError('mrt_mesh: give "normals" or "face_normals", not both')
-    return given
 
 
 def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,12 +11,12 @@ from .parameters import ParameterError
 from .variants import is_jit
 
 
-def keep_apart(mesh: Any, name: str, faces: int) -> None:
+def keep_apart(mesh: mi.Mesh, name: str, faces: int) -> None:
     """Keep Mitsuba from merging the mesh with others of its BSDF: it leaves those with attributes alone."""
     mesh.add_attribute(f"face_{name}", 1, [0.0] * faces)
 
 
-def write_buffers(mesh: Any, **buffers: Any) -> None:
+def write_buffers(mesh: mi.Mesh, **buffers: np.ndarray | mi.Float) -> None:
     """Give a mesh its ``faces``, ``vertex_positions``, ... as flat arrays."""
     if is_jit():
         # Scenes are loaded by several threads. The update evaluates the material of the mesh, too, which may
@@ -30,11 +28,12 @@ def write_buffers(mesh: Any, **buffers: Any) -> None:
     parameters.update()
 
 
-def triangles(mesh: Any) -> np.ndarray:
+def triangles(mesh: mi.Mesh) -> np.ndarray:
     """Return the corners of a mesh's triangles, float64 [M, 3, 3]."""
     parameters = mi.traverse(mesh)
-    points, faces = (np.array(parameters[name]) for name in ("vertex_positions", "faces"))
-    return points.astype(np.float64).reshape(-1, 3)[faces.reshape(-1, 3)]
+    points = np.array(parameters["vertex_positions"], np.float64).reshape(-1, 3)
+    faces = np.array(parameters["faces"]).reshape(-1, 3)
+    return points[faces]
 
 
 class Placement:
@@ -42,14 +41,16 @@ class Placement:
 
     def __init__(self, props: mi.Properties) -> None:
         matrix = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, np.float64)
-        self.linear, self.offset = matrix[:3, :3], matrix[:3, 3].tolist()
-        if not np.isfinite(matrix).all() or abs(np.linalg.det(self.linear)) == 0:
+        linear = matrix[:3, :3]
+        determinant = np.linalg.det(linear) if np.isfinite(matrix).all() else 0
+        if determinant == 0:
             raise ParameterError(
                 f'{props.plugin_name()}: "to_world" is not invertible; remove its zero scale'
             )
-        self.mirrors = bool(np.linalg.det(self.linear) < 0)
-        self.inverse = np.linalg.inv(self.linear).tolist()
-        self.linear = self.linear.tolist()
+        self.mirrors = bool(determinant < 0)
+        self.linear = linear.tolist()
+        self.inverse = np.linalg.inv(linear).tolist()
+        self.offset = matrix[:3, 3].tolist()
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Return the places of points [n, 3]."""
@@ -58,7 +59,7 @@ class Placement:
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame of the moved shape; works for vectors of any type."""
 
-        def row(v: Any) -> Any:
+        def row(v):
             return type(v)([sum(v[i] * self.inverse[i][j] for i in range(3)) for j in range(3)])
 
         o = frame.origin

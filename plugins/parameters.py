@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NoReturn
 
 import drjit as dr
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 # Mitsuba computes in float32; what is larger would become infinite there, and what is smaller zero
-LARGEST, SMALLEST = 3.4e38, 1.2e-38
+LARGEST = 3.4e38
+SMALLEST = 1.2e-38
 
 # From some thousand sides on triangles are slivers, between which rays slip through; more would not help
 MOST_SEGMENTS = 65536
@@ -19,7 +23,7 @@ class ParameterError(ValueError):
     """A plugin parameter has a wrong value. The text names plugin, key, value and what is allowed."""
 
 
-def _fail(props: Any, name: str, value: Any, allowed: str) -> NoReturn:
+def _fail(props: mi.Properties, name: str, value: object, allowed: str) -> NoReturn:
     raise ParameterError(f'{props.plugin_name()}: "{name}" is {value!r}, but must be {allowed}')
 
 
@@ -28,7 +32,7 @@ def _without_tiny(value: float) -> float:
 
 
 def number(
-    props: Any, name: str, default: float, *, above: float = -math.inf, least: float = -math.inf
+    props: mi.Properties, name: str, default: float, *, above: float = -math.inf, least: float = -math.inf
 ) -> float:
     """Return a finite float parameter, > ``above`` and >= ``least``."""
     value = props.get(name, default)
@@ -42,43 +46,38 @@ def number(
     return rounded
 
 
-def _checked(props: Any, name: str, default: Any, right: Callable[[Any], Any], allowed: str) -> Any:
+def integer(props: mi.Properties, name: str, default: int, *, least: int, most: float = math.inf) -> int:
+    """Return an integer parameter from ``least`` to ``most``."""
     value = props.get(name, default)
-    if not right(value):
-        _fail(props, name, value, allowed)
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        limits = f">= {least}" if most == math.inf else f"from {least} to {most}"
+        _fail(props, name, value, f"an integer {limits}")
     return value
 
 
-def integer(props: Any, name: str, default: int, *, least: int, most: float = math.inf) -> int:
-    """Return an integer parameter from ``least`` to ``most``."""
-    limits = f">= {least}" if most == math.inf else f"from {least} to {most}"
-    return _checked(
-        props,
-        name,
-        default,
-        lambda v: isinstance(v, int) and not isinstance(v, bool) and least <= v <= most,
-        f"an integer {limits}",
-    )
-
-
-def segments(props: Any, default: int) -> int:
+def segments(props: mi.Properties, default: int) -> int:
     """Return the parameter ``segments``: sides of a mesh."""
     return integer(props, "segments", default, least=3, most=MOST_SEGMENTS)
 
 
-def flag(props: Any, name: str, default: bool) -> bool:
+def flag(props: mi.Properties, name: str, default: bool) -> bool:
     """Return a boolean parameter."""
-    return _checked(props, name, default, lambda value: isinstance(value, bool), "true or false")
+    value = props.get(name, default)
+    if not isinstance(value, bool):
+        _fail(props, name, value, "true or false")
+    return value
 
 
-def choice(props: Any, name: str, allowed: Sequence[str]) -> str:
+def choice(props: mi.Properties, name: str, allowed: Sequence[str]) -> str:
     """Return one of a few strings; the first is the default."""
-    limits = "one of " + ", ".join(allowed)
-    return _checked(props, name, allowed[0], lambda v: isinstance(v, str) and v in allowed, limits)
+    value = props.get(name, allowed[0])
+    if not isinstance(value, str) or value not in allowed:
+        _fail(props, name, value, "one of " + ", ".join(allowed))
+    return value
 
 
 def vector(
-    props: Any, name: str, default: Sequence[float] | None = None, *, nonzero: bool = False
+    props: mi.Properties, name: str, default: Sequence[float] | None = None, *, nonzero: bool = False
 ) -> list[float]:
     """Return three finite numbers, not all 0 if ``nonzero``. Without a default the key is required."""
     if name not in props and default is None:
@@ -95,16 +94,20 @@ def vector(
     return numbers
 
 
-def spectrum(props: Any, name: str, default: float | None = None, *, emissive: bool = False) -> Any:
+def spectrum(
+    props: mi.Properties, name: str, default: float | None = None, *, emissive: bool = False
+) -> mi.Texture:
     """Return a spectrum or texture as a texture; numbers and colours must be finite and not negative.
 
     ``emissive``: one for lights, with the spectrum of daylight where a variant renders spectra.
     """
     value = props.get(name, default)
-    if isinstance(value, (int, float)) or dr.is_array_v(value):
-        levels = [float(x) for x in value] if dr.is_array_v(value) else [value]
+    if dr.is_array_v(value):
+        value = [float(x) for x in value]
+    if isinstance(value, int | float | list):
+        levels = value if isinstance(value, list) else [value]
         if isinstance(value, bool) or not all(0 <= x <= LARGEST for x in levels):
-            _fail(props, name, levels if len(levels) > 1 else value, "finite and not negative")
+            _fail(props, name, value, "finite and not negative")
     read = props.get_emissive_texture if emissive else props.get_unbounded_texture
     try:
         return read(name) if default is None else read(name, default)
@@ -112,6 +115,9 @@ def spectrum(props: Any, name: str, default: float | None = None, *, emissive: b
         _fail(props, name, value, "a number, a colour, a spectrum or a texture")
 
 
-def text(props: Any, name: str) -> str:
+def text(props: mi.Properties, name: str) -> str:
     """Return a string parameter."""
-    return _checked(props, name, "", lambda v: isinstance(v, str) and v, "a text that is not empty")
+    value = props.get(name, "")
+    if not isinstance(value, str) or not value:
+        _fail(props, name, value, "a text that is not empty")
+    return value

@@ -11,7 +11,6 @@ Applications 6(9), 1986.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,10 +19,12 @@ import numpy as np
 from .variants import aligned
 
 # With more cells, or more objects in all of them, lists would take more memory and time than they save
-MOST_CELLS, MOST_LISTED = 2**21, 2**22
+MOST_CELLS = 2**21
+MOST_LISTED = 2**22
 
 # Tangents of directions in float32 are off by less; so are places in cells
-_OFF_TANGENT, _OFF_CELL = 4e-6, 1e-3
+_OFF_TANGENT = 4e-6
+_OFF_CELL = 1e-3
 
 # Rays from a point miss it in float32 by less than this share of the coordinates
 _OFF_PLACE = 2.0**-21
@@ -42,34 +43,41 @@ class PointBuffer:
     def __init__(
         self, places: np.ndarray, boxes: np.ndarray, numbers: np.ndarray, balls: bool = False
     ) -> None:
-        faces, size = 6 * len(places), 2 ** int(np.ceil(np.log2(2 * np.sqrt(len(boxes)))))
+        faces = 6 * len(places)
+        size = 2 ** int(np.ceil(np.log2(2 * np.sqrt(len(boxes)))))
         extent = float(max(np.abs(places).max(), np.abs(boxes).max()))
         # The test of spheres in float32 also finds what passes by, the farther a ray starts, and is to be
         # obeyed
-        middle, radius = boxes.mean(axis=1), 0.5 * np.diff(boxes, axis=1)[:, 0].min(axis=1)
+        middle = boxes.mean(axis=1)
+        radius = 0.5 * np.diff(boxes, axis=1)[:, 0].min(axis=1)
         farthest = np.linalg.norm(middle - places[:, None], axis=2) + np.ptp(middle, axis=0).max()
         slack = np.sqrt(np.minimum(radius**2 + 2.0**-20 * farthest**2, 3 * radius**2)) - radius
         slack = (slack + 2 * _OFF_PLACE * extent)[..., None]
-        low, high = boxes[:, 0] - places[:, None] - slack, boxes[:, 1] - places[:, None] + slack
+        low = boxes[:, 0] - places[:, None] - slack
+        high = boxes[:, 1] - places[:, None] + slack
         columns = zip(*(_seen(low, high, side, balls) for side in range(6)), strict=True)
         face, thing, near, first, last = (np.concatenate(column) for column in columns)
-        start, end = np.full((faces, 2), np.inf), np.full((faces, 2), -np.inf)
+        start = np.full((faces, 2), np.inf)
+        end = -start
         np.minimum.at(start, face, first)
         np.maximum.at(end, face, last)
         start, end = (np.where(start <= end, x, 0).astype(np.float32).astype(float) for x in (start, end))
         while True:
             scale = np.divide(size, end - start, out=np.zeros_like(start), where=end > start)
-            cells = np.stack([first - start[face], last - start[face]]) * scale[face, :]
-            cells += np.reshape([-_OFF_CELL, _OFF_CELL], (2, 1, 1))
-            least, most = np.clip(np.floor(cells), 0, size - 1).astype(np.int64)
+            least = (first - start[face]) * scale[face] - _OFF_CELL
+            most = (last - start[face]) * scale[face] + _OFF_CELL
+            least, most = np.clip(np.floor([least, most]), 0, size - 1).astype(np.int64)
             width = most - least + 1
             areas = width.prod(axis=1)
             if size == 2 or (faces * size**2 <= MOST_CELLS and areas.sum() <= MOST_LISTED):
                 break
             size //= 2
         pair = np.repeat(np.arange(len(areas)), areas)
-        row, column = np.divmod(np.arange(len(pair)) - (np.cumsum(areas) - areas)[pair], width[pair, 0])
-        cell = (face[pair] * size + least[pair, 1] + row) * size + least[pair, 0] + column
+        before = np.cumsum(areas) - areas
+        row, column = np.divmod(np.arange(len(pair)) - before[pair], width[pair, 0])
+        column += least[pair, 0]
+        row += face[pair] * size + least[pair, 1]
+        cell = row * size + column
         order = np.lexsort((near[pair], cell))
         counts = np.bincount(cell, minlength=faces * size**2)
         ends = np.cumsum(counts + (counts > 0))  # of each list, after what ends it: an object at infinity
@@ -78,22 +86,32 @@ class PointBuffer:
         listed[ends[counts > 0] - 1] = listed[-1] = False
         lists[listed, 0] = near[pair][order]
         lists.view(np.uint32)[listed, 1] = numbers[thing[pair]][order]
-        self.lists, self.faces = aligned(lists), aligned(np.concatenate([start, scale], axis=1))
-        self.starts = aligned(np.where(counts > 0, ends - counts - 1, ends[-1]), np.uint32)
+        self.lists = aligned(lists)
+        self.faces = aligned(np.concatenate([start, scale], axis=1))
+        starts = np.where(counts > 0, ends - counts - 1, ends[-1])
+        self.starts = aligned(starts, np.uint32)
         self.size = dr.opaque(mi.UInt32, size)  # data: one kernel serves all places and sizes
         self.place = dr.opaque(mi.Point3f, places[0].tolist())
         self.off = dr.opaque(mi.Float, _OFF_PLACE * extent)
         dr.eval(self.starts, self.lists, self.faces)
 
-    def any(self, light: Any, to_light: Any, active: Any, test: Callable[[Any], Any]) -> Any:
+    def any(
+        self,
+        light: mi.UInt32,
+        to_light: mi.Vector3f,
+        active: mi.Bool,
+        test: Callable[[mi.UInt32], mi.Bool],
+    ) -> mi.Bool:
         """Return whether ``test(object)`` holds of an object listed where a ray comes to ``light`` from."""
 
-        def visit(thing: Any, state: tuple) -> tuple:
+        def visit(thing: mi.UInt32, state: tuple) -> tuple:
             return (dr.select(test(thing), -1, state[0]),)
 
-        return self._walk(light, mi.Vector3f(0), -to_light, active, visit, (mi.Float(1 + _SHORT),))[0] < 0
+        reach = mi.Float(1 + _SHORT)
+        (reach,) = self._walk(light, mi.Vector3f(0), -to_light, active, visit, (reach,))
+        return reach < 0
 
-    def nearest(self, ray: Any, active: Any, visit: Callable, state: tuple) -> tuple[tuple, Any]:
+    def nearest(self, ray: mi.Ray3f, active: mi.Bool, visit: Callable, state: tuple) -> tuple[tuple, mi.Bool]:
         """Call ``visit(object, state)`` as a tree does for rays that come from the first point, wherever they
         start; return the last state, and which rays these are.
         """
@@ -102,7 +120,15 @@ class PointBuffer:
         active = active & ~off & (dr.dot(o, ray.d) >= 0)
         return self._walk(mi.UInt32(0), o, ray.d, active, visit, state), active
 
-    def _walk(self, point: Any, o: Any, d: Any, active: Any, visit: Callable, state: tuple) -> tuple:
+    def _walk(
+        self,
+        point: mi.UInt32,
+        o: mi.Vector3f,
+        d: mi.Vector3f,
+        active: mi.Bool,
+        visit: Callable,
+        state: tuple,
+    ) -> tuple:
         """Visit the objects listed where a ray goes from a point, until all others are beyond its reach: the
         first of ``state``, in lengths of ``d`` from ``o``, which is relative to the point.
         """
@@ -110,32 +136,38 @@ class PointBuffer:
         on_x = (far.x >= far.y) & (far.x >= far.z)
         on_y = ~on_x & (far.y >= far.z)
 
-        def along(v: Any) -> Any:
+        def along(v: mi.Vector3f) -> mi.Float:
             return dr.select(on_x, v.x, dr.select(on_y, v.y, v.z))
 
-        depth, start = along(far), dr.abs(along(o))
+        depth = along(far)
+        start = dr.abs(along(o))
         inverse = 1 / depth
         face = dr.select(on_x, mi.UInt32(0), dr.select(on_y, mi.UInt32(2), 4))
         face += dr.select(along(d) < 0, mi.UInt32(1), 0) + 6 * point
         low_u, low_v, scale_u, scale_v = dr.gather(mi.Vector4f, self.faces, face)
 
-        def cell(across: Any, low: Any, scale: Any) -> Any:
-            return mi.UInt32(dr.clip(mi.Int32((across * inverse - low) * scale), 0, mi.Int32(self.size) - 1))
+        def cell(across: mi.Float, low: mi.Float, scale: mi.Float) -> mi.UInt32:
+            number = mi.Int32((across * inverse - low) * scale)
+            return mi.UInt32(dr.clip(number, 0, mi.Int32(self.size) - 1))
 
-        def entry(k: Any) -> tuple[Any, Any]:
+        def entry(k: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
             """Return the depth at which an object of the lists begins, or infinity, and the object."""
             near, thing = dr.gather(mi.Vector2f, self.lists, k)
             return near, dr.reinterpret_array(mi.UInt32, thing)
 
+        def goes_on(k: mi.UInt32, near: mi.Float, thing: mi.UInt32, state: tuple) -> mi.Bool:
+            return active & (near < dr.fma(state[0], depth, start))
+
+        def to_next(k: mi.UInt32, near: mi.Float, thing: mi.UInt32, state: tuple) -> tuple:
+            return k + 1, *entry(k + 1), visit(thing, state)
+
         row = cell(dr.select(on_x | on_y, d.z, d.y), low_v, scale_v)
         column = cell(dr.select(on_x, d.y, d.x), low_u, scale_u)
-        first = dr.gather(mi.UInt32, self.starts, (face * self.size + row) * self.size + column)
-        return dr.while_loop(
-            (first, *entry(first), state),
-            lambda k, near, thing, state: active & (near < dr.fma(state[0], depth, start)),
-            lambda k, near, thing, state: (k + 1, *entry(k + 1), visit(thing, state)),
-            label="point buffer",
-        )[3]
+        number = (face * self.size + row) * self.size + column
+        first = dr.gather(mi.UInt32, self.starts, number)
+        begin = first, *entry(first), state
+        *_, state = dr.while_loop(begin, goes_on, to_next, label="point buffer")
+        return state
 
 
 def _seen(low: np.ndarray, high: np.ndarray, side: int, balls: bool) -> tuple[np.ndarray, ...]:
@@ -148,17 +180,27 @@ def _seen(low: np.ndarray, high: np.ndarray, side: int, balls: bool) -> tuple[np
     axis, backwards = divmod(side, 2)
     across = [a for a in range(3) if a != axis]
     near, far = (-high, -low) if backwards else (low, high)
-    near, far, low, high = near[..., axis, None], far[..., axis, None], low[..., across], high[..., across]
-    z, radius, along, near = (near + far) / 2, (far - near) / 2, (low + high) / 2, np.maximum(near, 0)
+    near = near[..., axis, None]
+    far = far[..., axis, None]
+    low = low[..., across]
+    high = high[..., across]
+    z = (near + far) / 2
+    radius = (far - near) / 2
+    along = (low + high) / 2
+    near = np.maximum(near, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        first, last = low / np.where(low < 0, near, far), high / np.where(high > 0, near, far)
+        first = low / np.where(low < 0, near, far)
+        last = high / np.where(high > 0, near, far)
         if balls:  # between the lines that touch them
             square = np.where(z > 1.001 * radius, z**2 - radius**2, np.nan)
             root = radius * np.sqrt(square + along**2)
             first = np.fmax(first, (along * z - root) / square)
             last = np.fmin(last, (along * z + root) / square)
-    first, last = first - _OFF_TANGENT, last + _OFF_TANGENT
+    first -= _OFF_TANGENT
+    last += _OFF_TANGENT
     seen = (far[..., 0] > 0) & ((first < 1) & (last > -1)).all(axis=2)
     point, thing = np.nonzero(seen)
     depth = near[seen][:, 0] * (1 - 2.0**-18)
-    return 6 * point + side, thing, depth, np.clip(first[seen], -1, 1), np.clip(last[seen], -1, 1)
+    first = np.clip(first[seen], -1, 1)
+    last = np.clip(last[seen], -1, 1)
+    return 6 * point + side, thing, depth, first, last

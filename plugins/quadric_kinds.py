@@ -7,7 +7,8 @@ surface, ``ends`` what is at both ends of its axis.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
@@ -18,11 +19,10 @@ import numpy as np
 
 from .intersect import BASE, LATERAL, TOP, Frame, intersect_cone, intersect_cylinder, intersect_sphere
 
-POINT, DISC, BALL = (0, 0, 0), (1, 1, 0), (1, 1, 1)
-"""What the ends of a quadric are, by the squared semi-axes of their unit frame that span them."""
-
-Hit = tuple[Any, Any]  # t in units of |d|, inf for a miss, and the part of the surface
-SurfacePoint = tuple[Any, Any, Any, Any]  # on the surface; the outward unit normal; texture coordinates u, v
+# What the ends of a quadric are, by the squared semi-axes of their unit frame that span them
+POINT = (0, 0, 0)
+DISC = (1, 1, 0)
+BALL = (1, 1, 1)
 
 # Vertices [n, 8] in the unit frame: place, gradient that becomes the normal, and texture coordinates; faces
 # [m, 3], counter-clockwise seen from outside in a right-handed frame
@@ -32,24 +32,32 @@ UnitMesh = tuple[np.ndarray, np.ndarray]
 class Sphere:
     """A sphere of radius 1 around 0."""
 
-    points, width = 1, 4
-    parts, ends, closed = (LATERAL,), (BALL, BALL), True
+    points = 1
+    width = 4
+    parts = (LATERAL,)
+    ends = (BALL, BALL)
+    closed = True
 
-    def frame(self, center: Any, radius: Any) -> Frame:
+    def frame(self, center, radius) -> Frame:
         """Return the unit frame of a sphere."""
         inverse = 1 / radius
-        zero, make = 0 * inverse, type(center)
-        rows = [inverse, zero, zero], [zero, inverse, zero], [zero, zero, inverse]
-        return Frame(center, *map(make, rows))
+        zero = 0 * inverse
+        make = type(center)
+        x = make([inverse, zero, zero])
+        y = make([zero, inverse, zero])
+        z = make([zero, zero, inverse])
+        return Frame(center, x, y, z)
 
-    def intersect(self, o: Any, d: Any, frame: Frame) -> Hit:
-        """Return the first hit at t > 0."""
+    def intersect(self, o, d, frame: Frame):
+        """Return t > 0 of the first hit in units of |d|, inf for a miss, and the part that is hit."""
         o = frame.point(o)
-        return intersect_sphere(o, frame.vector(d), type(o)([0.0, 0.0, 0.0]), 1.0), LATERAL
+        center = type(o)([0.0, 0.0, 0.0])
+        return intersect_sphere(o, frame.vector(d), center, 1.0), LATERAL
 
-    def surface(self, p: Any, part: Any, frame: Frame) -> SurfacePoint:
+    def surface(self, p, part, frame: Frame):
         """Put a point near the sphere onto it, along the normal.
 
+        Returns the point, the outward unit normal and the texture coordinates:
         u = azimuth / 2π in [0, 1), v = angle to +z over π, as in Mitsuba's ``sphere``.
         """
         q = frame.point(p)
@@ -62,19 +70,23 @@ class Sphere:
         v = dr.acos(dr.clip(gradient.z, -1, 1)) / dr.pi
         return p - n * ((r - 1) * inverse), n, _turn(q), v
 
-    def derivatives(self, q: Any, part: Any) -> tuple[Any, Any]:
+    def derivatives(self, q, part):
         """Return derivatives by u and v of a surface point ``q``, both in the unit frame."""
         r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
         x, y = _azimuth(q, r)
-        around = type(q)([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
-        return around, type(q)([q.z * x, q.z * y, -r]) * dr.pi
+        make = type(q)
+        around = make([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
+        along = make([q.z * x, q.z * y, -r])
+        return around, along * dr.pi
 
     def mesh(self, segments: int = 0) -> UnitMesh:
         """Return an octahedron, whatever ``segments``."""
-        points = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
-        octants = [(x, y, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]
-        turned = [(sum(octant) % 2) == 1 for octant in octants]  # an odd number of mirrored axes
-        faces = [octant[::-1] if turn else octant for octant, turn in zip(octants, turned, strict=True)]
+        points = np.repeat(np.eye(3), 2, axis=0)  # each axis, forwards and backwards
+        points[1::2] = 0 - points[1::2]
+        faces = []
+        for octant in itertools.product((0, 1), (2, 3), (4, 5)):
+            mirrored = sum(octant) % 2 == 1  # along an odd number of axes
+            faces.append(octant[::-1] if mirrored else octant)
         return np.hstack([points, points, np.zeros((6, 2))]), np.array(faces)
 
 
@@ -85,14 +97,16 @@ class Axial:
     Texture coordinates: u = azimuth / 2π in [0, 1), v = 1 - z on the side, the unit square around a disc.
     """
 
-    points, width, slope = 2, 7, 0
+    points = 2
+    width = 7
+    slope = 0
     parts: tuple[int, ...] = (LATERAL, BASE)
     ends = (DISC, DISC)
 
     def __init__(self, *, capped: bool = True) -> None:
         self.closed = capped
 
-    def frame(self, p0: Any, p1: Any, radius: Any) -> Frame:
+    def frame(self, p0, p1, radius) -> Frame:
         """Return the frame whose z runs from p0 to p1; seen against it, u grows counter-clockwise.
 
         Source of the tangents: Duff et al., "Building an Orthonormal Basis, Revisited", 2017.
@@ -104,13 +118,15 @@ class Axial:
         sign = dr.select(n.z >= 0, 1, -1)
         a = -1 / (sign + n.z)
         b = n.x * n.y * a
-        s, t = make([1 + sign * n.x * n.x * a, sign * b, -sign * n.x]), make([b, sign + n.y * n.y * a, -n.y])
+        s = make([1 + sign * n.x * n.x * a, sign * b, -sign * n.x])
+        t = make([b, sign + n.y * n.y * a, -n.y])
         return Frame(p0, s / radius, t / radius, axis / length2)
 
-    def surface(self, p: Any, part: Any, frame: Frame) -> SurfacePoint:
+    def surface(self, p, part, frame: Frame):
         """Put a point near the given part onto it by a Newton step along the normal.
 
-        At an apex the normal is that of one of the generatrices.
+        Returns the point, the outward unit normal and the texture coordinates. At an apex the normal is that
+        of one of the generatrices.
         """
         q = frame.point(p)
         r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
@@ -121,17 +137,21 @@ class Axial:
         off_disc = q.z - 1 if on_base is True else dr.select(on_base, q.z - 1, -q.z)
         off_side = r - q.z if self.slope else r - 1
         up = dr.select(side, -self.slope, dr.select(on_base, 1, -1))
-        g = frame.gradient(type(q)([dr.select(side, x, 0), dr.select(side, y, 0), up]))
+        gradient = type(q)([dr.select(side, x, 0), dr.select(side, y, 0), up])
+        g = frame.gradient(gradient)
         inverse = 1 / dr.norm(g)
         n = g * inverse
         u = dr.select(side, _turn(q), 0.5 + 0.5 * q.x)
-        v = dr.clip(dr.select(side, 1 - q.z, 0.5 + 0.5 * q.y), 0, 1)
-        return p - n * (dr.select(side, off_side, off_disc) * inverse), n, u, v
+        v = dr.select(side, 1 - q.z, 0.5 + 0.5 * q.y)
+        distance = dr.select(side, off_side, off_disc) * inverse
+        return p - n * distance, n, u, dr.clip(v, 0, 1)
 
-    def derivatives(self, q: Any, part: Any) -> tuple[Any, Any]:
+    def derivatives(self, q, part):
         """Return derivatives by u and v of a surface point ``q``, both in the unit frame."""
-        side, zero = part == LATERAL, 0 * q.x
-        x, y = _azimuth(q, dr.sqrt(dr.square(q.x) + dr.square(q.y)))
+        side = part == LATERAL
+        zero = 0 * q.x
+        r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
+        x, y = _azimuth(q, r)
         around = -2 * dr.pi * q.y, 2 * dr.pi * q.x, zero
         along = -self.slope * x, -self.slope * y, -1 + zero
         by_u = [dr.select(side, a, b) for a, b in zip(around, (2 + zero, zero, zero), strict=True)]
@@ -142,18 +162,22 @@ class Axial:
 class Cone(Axial):
     """The apex at 0, the base disc at z = 1."""
 
-    slope, ends = 1, (POINT, DISC)
+    slope = 1
+    ends = (POINT, DISC)
 
-    def intersect(self, o: Any, d: Any, frame: Frame) -> Hit:
-        """Return the first hit at t > 0."""
+    def intersect(self, o, d, frame: Frame):
+        """Return t > 0 of the first hit in units of |d|, inf for a miss, and the part that is hit."""
         return intersect_cone(o, d, frame, capped=self.closed)
 
     def mesh(self, segments: int) -> UnitMesh:
         """Return a fan from the apex, with a vertex and a normal there for each triangle, and the base."""
-        azimuth, i = 2 * np.pi * np.arange(segments + 1) / segments, np.arange(segments)
-        apex = _ring(0.5 * (azimuth[1:] + azimuth[:-1]), 0.0, slope=-1.0, v=1.0, radius=0.0)
+        azimuth = 2 * np.pi * np.arange(segments + 1) / segments
+        between = 0.5 * (azimuth[1:] + azimuth[:-1])
+        apex = _ring(between, 0.0, slope=-1.0, v=1.0, radius=0.0)
+        rim = _ring(azimuth, 1.0, slope=-1.0, v=0.0)
+        i = np.arange(segments)
         faces = np.stack([i, i + segments + 1, i + 1], axis=1)
-        side = np.concatenate([_ring(azimuth, 1.0, slope=-1.0, v=0.0), apex]), faces
+        side = np.concatenate([rim, apex]), faces
         return _join(side, _disc(segments, 1.0)) if self.closed else side
 
 
@@ -162,16 +186,19 @@ class Cylinder(Axial):
 
     parts = (LATERAL, BASE, TOP)
 
-    def intersect(self, o: Any, d: Any, frame: Frame) -> Hit:
-        """Return the first hit at t > 0."""
+    def intersect(self, o, d, frame: Frame):
+        """Return t > 0 of the first hit in units of |d|, inf for a miss, and the part that is hit."""
         return intersect_cylinder(o, d, frame, capped=self.closed)
 
     def mesh(self, segments: int) -> UnitMesh:
         """Return a strip of quads split in two, and two discs."""
-        azimuth, i = 2 * np.pi * np.arange(segments + 1) / segments, np.arange(segments)
+        azimuth = 2 * np.pi * np.arange(segments + 1) / segments
+        i = np.arange(segments)
         k = i + segments + 1
         rings = [_ring(azimuth, z, slope=0.0, v=1.0 - z) for z in (0.0, 1.0)]
-        faces = np.concatenate([np.stack([i, i + 1, k], 1), np.stack([i + 1, k + 1, k], 1)])
+        lower = np.stack([i, i + 1, k], axis=1)
+        upper = np.stack([i + 1, k + 1, k], axis=1)
+        faces = np.concatenate([lower, upper])
         side = np.concatenate(rings), faces
         return _join(side, _disc(segments, 0.0), _disc(segments, 1.0)) if self.closed else side
 
@@ -185,14 +212,14 @@ KINDS: dict[str, Any] = {
 }
 
 
-def _azimuth(q: Any, r: Any) -> tuple[Any, Any]:
+def _azimuth(q, r):
     """Return cosine and sine of the azimuth of ``q`` at distance r from the axis; on the axis, those of 0."""
     on_axis = r == 0
     inverse = 1 / dr.select(on_axis, 1, r)
     return dr.select(on_axis, 1, q.x * inverse), q.y * inverse
 
 
-def _turn(q: Any) -> Any:
+def _turn(q):
     """Return the azimuth of ``q`` over 2π, in [0, 1)."""
     azimuth = dr.atan2(q.y, q.x) / (2 * dr.pi)
     return dr.select(azimuth < 0, azimuth + 1, azimuth)
@@ -200,17 +227,21 @@ def _turn(q: Any) -> Any:
 
 def _ring(azimuth: np.ndarray, z: float, *, slope: float, v: float, radius: float = 1.0) -> np.ndarray:
     """Return vertices around the axis."""
-    x, y, one = np.cos(azimuth), np.sin(azimuth), np.ones_like(azimuth)
+    x = np.cos(azimuth)
+    y = np.sin(azimuth)
+    one = np.ones_like(azimuth)
     around = azimuth / (2 * np.pi)
     return np.stack([radius * x, radius * y, z * one, x, y, slope * one, around, v * one], axis=1)
 
 
 def _disc(segments: int, z: float) -> UnitMesh:
     """Return a fan around the centre, facing away from z = 1/2."""
-    rim = _ring(2 * np.pi * np.arange(segments) / segments, z, slope=0, v=0)
-    vertices = np.concatenate([rim, [[0, 0, z, 0, 0, 0, 0, 0]]])
-    vertices[:, 3:6], vertices[:, 6:] = (0, 0, 1 if z > 0.5 else -1), 0.5 + 0.5 * vertices[:, :2]
     i = np.arange(segments)
+    rim = _ring(2 * np.pi * i / segments, z, slope=0, v=0)
+    center = [0, 0, z, 0, 0, 0, 0, 0]
+    vertices = np.concatenate([rim, [center]])
+    vertices[:, 3:6] = 0, 0, 1 if z > 0.5 else -1
+    vertices[:, 6:] = 0.5 + 0.5 * vertices[:, :2]
     faces = np.stack([i, (i + 1) % segments, np.full_like(i, segments)], axis=1)
     return vertices, faces if z > 0.5 else faces[:, ::-1]
 
@@ -252,11 +283,14 @@ class QuadricTable:
 
     def boxes(self) -> np.ndarray:
         """Return the bounding boxes [n, 2, 3]: of ellipsoids at both ends."""
-        columns, kind = np.linalg.inv(self.rows), KINDS[self.kind]
+        columns = np.linalg.inv(self.rows)
+        kind = KINDS[self.kind]
         half = np.stack([np.sqrt((columns**2 * end).sum(axis=2)) for end in kind.ends], axis=1)
         axis = columns[:, :, 2] * (kind.points - 1)
         centers = np.stack([self.origins, self.origins + axis], axis=1)  # [n, end, 3]
-        return np.stack([(centers - half).min(axis=1), (centers + half).max(axis=1)], axis=1)
+        low = (centers - half).min(axis=1)
+        high = (centers + half).max(axis=1)
+        return np.stack([low, high], axis=1)
 
     def numbers(self, kinds: list[str]) -> np.ndarray:
         """Return what a kernel for such kinds reads of each object, [n, 4, 4]: four numbers at a time.
@@ -264,8 +298,10 @@ class QuadricTable:
         A row and a coordinate of the origin, three times; kind, size of coordinates, 0, side of the normal.
         """
         numbers = np.zeros((len(self.rows), 4, 4))
-        numbers[:, :3, :3], numbers[:, :3, 3] = self.rows, self.origins
-        numbers[:, 3, 0], numbers[:, 3, 1] = kinds.index(self.kind), np.abs(self.boxes()).max(axis=(1, 2))
+        numbers[:, :3, :3] = self.rows
+        numbers[:, :3, 3] = self.origins
+        numbers[:, 3, 0] = kinds.index(self.kind)
+        numbers[:, 3, 1] = np.abs(self.boxes()).max(axis=(1, 2))
         numbers[:, 3, 3] = -1 if self.flipped else 1
         return numbers
 
@@ -278,8 +314,9 @@ class QuadricTable:
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
         faces = faces if np.linalg.det(self.rows[0]) > 0 else faces[:, ::-1]
         first = len(vertices) * np.arange(len(self.rows))
+        every = faces[None] + first[:, None, None]  # [n, faces, 3]
         return {
-            "faces": (faces[None] + first[:, None, None]).astype(np.uint32).ravel(),
+            "faces": every.astype(np.uint32).ravel(),
             "vertex_positions": positions.astype(np.float32).ravel(),
             "vertex_normals": normals.astype(np.float32).ravel(),
         }
@@ -299,19 +336,19 @@ class Columns(list):
         """Return the array [n, 3] of the columns."""
         return np.stack([np.array(c) for c in self], axis=1)
 
-    def __add__(self, other: Sequence[Any]) -> Columns:
+    def __add__(self, other) -> Columns:
         return Columns(a + b for a, b in zip(self, other, strict=True))
 
-    def __sub__(self, other: Sequence[Any]) -> Columns:
+    def __sub__(self, other) -> Columns:
         return Columns(a - b for a, b in zip(self, other, strict=True))
 
-    def __mul__(self, factor: Any) -> Columns:
+    def __mul__(self, factor) -> Columns:
         return Columns(a * factor for a in self)
 
-    def __truediv__(self, divisor: Any) -> Columns:
+    def __truediv__(self, divisor) -> Columns:
         return self * (1 / divisor)
 
 
-def column(values: np.ndarray) -> Any:
+def column(values: np.ndarray):
     """Return one column of float64 numbers."""
     return drjit.scalar.ArrayXf64(np.ascontiguousarray(values, np.float64))

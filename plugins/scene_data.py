@@ -47,8 +47,11 @@ class SceneData:
     """
 
     def __init__(self, reading: Reading, plan: KernelPlan, kept: Kept) -> None:
-        self.plan, self.facts, self.environment = plan, reading.facts, reading.snapshot.environment
-        now, self._kept = reading.snapshot, kept
+        now = reading.snapshot
+        self.plan = plan
+        self.facts = reading.facts
+        self.environment = now.environment
+        self._kept = kept
         parts = now.shape_part, now.material_part, now.light_part
         self.known = now.material_part.known and now.light_part.known
         self.differentiated = any(part.differentiated for part in parts)  #: are derivatives wanted
@@ -86,7 +89,8 @@ class SceneData:
 
     def arrays(self, scene: mi.Scene) -> list[Any] | None:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
-        plan, sky = self.plan, self.environment
+        plan = self.plan
+        sky = self.environment
         if not self.known:
             return None
         tabled = plan.merged and (plan.lights == "none" or self.facts.tabled)
@@ -107,8 +111,9 @@ class SceneData:
         t, plane, on_plane = self.planes.intersect(ray, active)
         # What lies behind a plane need not be looked for
         ray = mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths)
-        # ``scale``: the size of the coordinates of what is hit
-        si, found, scale = dr.zeros(mi.SurfaceInteraction3f), mi.Bool(False), mi.Float(0)
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        found = mi.Bool(False)
+        scale = mi.Float(0)  # size of the coordinates of what is hit
         if plan.bvh:
             pi = (self.bvh or scene).ray_intersect_preliminary(ray, plan.coherent, active)
             found = active & pi.is_valid()
@@ -137,7 +142,8 @@ class SceneData:
             found = found | on_plane
         si.sh_frame = _frame_along(si) if plan.tangents else mi.Frame3f(si.sh_frame.n)
         si.wi = si.to_local(-ray.d)
-        si.time, si.wavelengths = ray.time, ray.wavelengths
+        si.time = ray.time
+        si.wavelengths = ray.wavelengths
         error = CURVED * dr.maximum(scale, dr.max(dr.abs(si.p)))
         return Hit(si, found, error if flat is None else dr.minimum(error, flat))
 
@@ -210,7 +216,8 @@ def _trace(reading: Reading, plan: KernelPlan) -> tuple:
     exact = [s for s in reading.quadrics if s.quadrics().kind in plan.quadrics]
     planes = reading.planes if plan.planes else []
     own = {id(s) for s in (*exact, *planes)}
-    others, bvh = [s for s in reading.snapshot.shapes if id(s) not in own], None
+    others = [s for s in reading.snapshot.shapes if id(s) not in own]
+    bvh = None
     if others and not plan.bvh:
         raise ValueError(f"the plan leaves {len(others)} shapes untraced: set its bvh to True")
     if own and others:
@@ -218,7 +225,8 @@ def _trace(reading: Reading, plan: KernelPlan) -> tuple:
         # Mitsuba names an object after its key, and these belong to another scene: they get their names back
         things = [*others, *reading.snapshot.groups]
         names = [thing.id() for thing in things]
-        bvh = mi.load_dict({"type": "scene", **{f"shape_{i}": thing for i, thing in enumerate(things)}})
+        shapes = {f"shape_{i}": thing for i, thing in enumerate(things)}
+        bvh = mi.load_dict({"type": "scene", **shapes})
         for thing, name in zip(things, names, strict=True):
             thing.set_id(name)
     spheres = Spheres(others) if plan.spheres != "none" else None
@@ -245,7 +253,8 @@ def _eval_bsdf(
     facing: list[mi.Bool],
     active: mi.Bool,
 ) -> tuple[list[mi.UnpolarizedSpectrum], mi.UnpolarizedSpectrum, mi.Float]:
-    reflectance, int_ior = mi.UnpolarizedSpectrum(0), mi.Float(1)
+    reflectance = mi.UnpolarizedSpectrum(0)
+    int_ior = mi.Float(1)
     if bsdf is None:
         return [mi.UnpolarizedSpectrum(0) for _ in wos], reflectance, int_ior
     seen = zip(wos, facing, strict=True)
@@ -253,7 +262,8 @@ def _eval_bsdf(
         lobes = bsdf.lobes(si)
         values = [lobes.value(context, Pair.above(si.wi, wo, there)) for wo, there in seen]
         if mirror:
-            reflectance, int_ior = lobes.mirror_reflectance, lobes.given["int_ior"]
+            reflectance = lobes.mirror_reflectance
+            int_ior = lobes.given["int_ior"]
         return values, reflectance, int_ior
     values = [mi.unpolarized_spectrum(bsdf.eval(context, si, wo, there)) for wo, there in seen]
     if mirror and bsdf.has_attribute("mirror_reflectance"):
@@ -262,7 +272,8 @@ def _eval_bsdf(
     elif mirror and has_mirror(bsdf):
         context = mi.BSDFContext()
         context.type_mask = +mi.BSDFFlags.DeltaReflection
-        reflectance = mi.unpolarized_spectrum(bsdf.sample(context, si, mi.Float(0), mi.Point2f(0), active)[1])
+        _, weight = bsdf.sample(context, si, mi.Float(0), mi.Point2f(0), active)
+        reflectance = mi.unpolarized_spectrum(weight)
     return values, reflectance, int_ior
 
 
@@ -275,11 +286,11 @@ def _ray_arrays(scene: mi.Scene) -> list[Any]:
         return [scene]
     with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal):
         indices = dr.detail.collect_indices(scene)
-    handles, shapes = [mi.UInt64(0)] * 3, mi.UInt32(0)
-    found: list[Any] = dr.detail.update_indices([*handles, shapes], indices[:4])
+    handle = mi.UInt64(0)
+    arrays: list[Any] = dr.detail.update_indices([handle, handle, handle, mi.UInt32(0)], indices[:4])
     expected = dr.reinterpret_array(mi.UInt32, scene.shapes_dr())
-    numbers, known = (np.sort(array) for array in (found[-1], expected))
-    return found if np.array_equal(numbers, known) else [scene]  # fields may come in another order
+    known = np.array_equal(np.sort(arrays[-1]), np.sort(expected))
+    return arrays if known else [scene]  # fields may come in another order
 
 
 def _arrays_in(value: Any) -> list[Any]:
@@ -290,5 +301,8 @@ def _arrays_in(value: Any) -> list[Any]:
         return [value] if dr.width(value) else []  # Dr.Jit aborts on an array of nothing
     if type(value).__module__.startswith(f"{__package__}.") and hasattr(value, "__dict__"):
         value = vars(value)
-    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
-    return [array for part in inside for array in _arrays_in(part)]
+    if isinstance(value, dict):
+        value = value.values()
+    elif not isinstance(value, list | tuple):
+        return []
+    return [array for part in value for array in _arrays_in(part)]

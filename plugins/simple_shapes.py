@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -13,11 +13,14 @@ from .intersect import intersect_plane
 from .snapshot import parameters_of
 from .variants import ByShape, Table, first
 
+if TYPE_CHECKING:
+    from .plane import MrtPlane
+
 
 class Planes:
     """Equations and tangents of all planes, as kernel data."""
 
-    def __init__(self, shapes: Sequence[Any]) -> None:
+    def __init__(self, shapes: Sequence[MrtPlane]) -> None:
         sides = [-1 if s.has_flipped_normals() else 1 for s in shapes]
         self.equations = [
             (mi.Vector3f((side * s.unit_normal).tolist()), mi.Float(side * s.distance))
@@ -30,7 +33,9 @@ class Planes:
 
     def intersect(self, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32, mi.Bool]:
         """Return the distance of the nearest plane, or ``ray.maxt``, its number, and if there is one."""
-        t, index, found = mi.Float(ray.maxt), mi.UInt32(0), mi.Bool(False)
+        t = mi.Float(ray.maxt)
+        index = mi.UInt32(0)
+        found = mi.Bool(False)
         for k, (normal, distance) in enumerate(self.equations):
             t_plane = intersect_plane(ray.o, ray.d, normal, distance)
             closer = active & (t_plane < t)
@@ -63,7 +68,9 @@ class Planes:
         """
         (n, distance), *others = self.equations
         for k, (normal, d) in enumerate(others, start=1):  # of few planes, quicker chosen than looked up
-            n, distance = dr.select(index == k, normal, n), dr.select(index == k, d, distance)
+            chosen = index == k
+            n = dr.select(chosen, normal, n)
+            distance = dr.select(chosen, d, distance)
         p = dr.fma(ray.d, ray.maxt, ray.o)
         # Along a grazing ray the error of t is far larger than that of the plane
         p -= n * _height(p, n, distance)
@@ -81,7 +88,7 @@ class Planes:
         return dr.select(where, dr.abs(distance), scale)
 
 
-def _height(p: Any, normal: Any, distance: Any) -> Any:
+def _height(p: mi.Point3f, normal: mi.Vector3f, distance: mi.Float) -> mi.Float:
     """Return the signed distance of a point from a plane."""
     return dr.dot(normal, p) + distance
 
@@ -105,7 +112,8 @@ class Spheres:
         Derivatives and texture coordinates are left out.
         """
         si = dr.zeros(mi.SurfaceInteraction3f)
-        si.t, si.shape = dr.select(found, pi.t, dr.inf), dr.select(found, pi.shape, None)
+        si.t = dr.select(found, pi.t, dr.inf)
+        si.shape = dr.select(found, pi.shape, None)
         center, radius = self._center_and_radius(si, found)
         n = dr.normalize(dr.fma(ray.d, pi.t, ray.o) - center)
         si.p = dr.fma(n, radius, center)
@@ -120,7 +128,8 @@ class Spheres:
         length = dr.norm(v)
         on_sphere = found & (radius > 0) & (length > 0)
         # A shift without a derivative: how the hit moves with the sphere is for Mitsuba to say
-        si.p += dr.select(on_sphere, center + v * (radius / dr.select(on_sphere, length, 1)) - p, 0)
+        scale = radius / dr.select(on_sphere, length, 1)
+        si.p += dr.select(on_sphere, center + v * scale - p, 0)
 
     def _center_and_radius(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> tuple[mi.Point3f, mi.Float]:
         row = self.by_shape(si, found)
@@ -133,7 +142,8 @@ class Spheres:
         frames = [mi.get_property(value, kind, s).matrix for s, (_, value, kind) in found]
         numbers = np.array([[first(m[row][column]) for row in range(3) for column in (0, 3)] for m in frames])
         # To the last bit, which Mitsuba's boxes do not have
-        centers, radii = numbers[:, 1::2], np.linalg.norm(numbers[:, ::2], axis=1)[:, None]
+        centers = numbers[:, 1::2]
+        radii = np.linalg.norm(numbers[:, ::2], axis=1)[:, None]
         self.balls = Table(mi.Vector4f, np.column_stack([centers, radii]).tolist())
         return np.stack([centers - radii, centers + radii], axis=1), np.arange(len(radii)), True
 
@@ -141,22 +151,28 @@ class Spheres:
         """Return whether a sphere is in the way of a ray: to the bit what Mitsuba says."""
         row = self.balls(index, mi.Bool(True))
         o = ray.o - mi.Point3f(row.x, row.y, row.z)
-        a, b = dr.squared_norm(ray.d), 2 * dr.dot(o, ray.d)
+        a = dr.squared_norm(ray.d)
+        b = 2 * dr.dot(o, ray.d)
         c = dr.squared_norm(o) - dr.square(row.w)
-        q = -0.5 * (b + dr.copysign(dr.sqrt(dr.fma(b, b, -(4 * a * c))), b))  # NaN where it misses
-        one, other = q / a, c / q
-        near, far = dr.minimum(one, other), dr.maximum(one, other)
+        root = dr.sqrt(dr.fma(b, b, -(4 * a * c)))  # NaN where it misses
+        q = -0.5 * (b + dr.copysign(root, b))
+        one = q / a
+        other = c / q
+        near = dr.minimum(one, other)
+        far = dr.maximum(one, other)
         return (near <= ray.maxt) & (far >= 0) & ((near >= 0) | (far <= ray.maxt))
 
 
-def is_sphere(shape: Any) -> bool:
+def is_sphere(shape: mi.Shape) -> bool:
     """Return whether a shape is Mitsuba's ``sphere``."""
     return shape.shape_type() == +mi.ShapeType.Sphere
 
 
-def center_and_radius(shape: Any) -> list[float]:
+def center_and_radius(shape: mi.Shape) -> list[float]:
     """Return those of a sphere, zeros for another shape."""
     if not is_sphere(shape):
         return [0.0] * 4
-    low, high = ([float(c) for c in corner] for corner in (shape.bbox().min, shape.bbox().max))
-    return [0.5 * (a + b) for a, b in zip(low, high, strict=True)] + [0.5 * (high[0] - low[0])]
+    low = [float(c) for c in shape.bbox().min]
+    high = [float(c) for c in shape.bbox().max]
+    center = [0.5 * (a + b) for a, b in zip(low, high, strict=True)]
+    return [*center, 0.5 * (high[0] - low[0])]

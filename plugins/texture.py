@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
 from .parameters import ParameterError, text
@@ -43,28 +41,28 @@ class MrtTexture(mi.Texture):
         # the edge
         scale = [(width - 1) / width, (height - 1) / height, 1]
         to_uv = mi.ScalarTransform4f().translate([0.5 / width, 0.5 / height, 0]).scale(scale)
-        self.texels = mi.load_dict({"type": "bitmap", "bitmap": bitmap, "filter_type": "nearest",
-                                    "wrap_mode": "clamp", "to_uv": to_uv})  # fmt: skip
+        stock = {"type": "bitmap", "bitmap": bitmap, "filter_type": "nearest", "wrap_mode": "clamp"}
+        self.texels = mi.load_dict({**stock, "to_uv": to_uv})
 
-    def traverse(self, callback: Any) -> None:
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("texels", self.texels, mi.ParamFlags.Differentiable)
 
-    def eval(self, si: Any, active: Any = True) -> Any:
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
         return self.texels.eval(si, active)
 
-    def eval_1(self, si: Any, active: Any = True) -> Any:
+    def eval_1(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Float:
         return self.texels.eval_1(si, active)
 
-    def eval_3(self, si: Any, active: Any = True) -> Any:
+    def eval_3(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
         return self.texels.eval_3(si, active)
 
-    def mean(self) -> Any:
+    def mean(self) -> mi.Float:
         return self.texels.mean()
 
     def is_spatially_varying(self) -> bool:
         return True
 
-    def resolution(self) -> Any:
+    def resolution(self) -> mi.ScalarVector2i:
         return self.texels.resolution()
 
     def to_string(self) -> str:

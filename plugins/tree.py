@@ -14,7 +14,6 @@ the distance in sizes of the object: from hundreds of sizes away, rays are lost.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -38,12 +37,20 @@ class Tree:
         depth = max(count - 1, 1).bit_length()  # the root has two children, if of nothing
         self.leaves = 1 << depth
         self.leaf_of = np.empty(count, np.int64)
-        self.leaf_of[_sort(boxes.mean(axis=1), depth)] = np.arange(count) * self.leaves // count
+        order = _sort(boxes.mean(axis=1), depth)
+        self.leaf_of[order] = np.arange(count) * self.leaves // count
         self.boxes = aligned(_heap(boxes, self.leaf_of, self.leaves))
         self.first_leaf = dr.opaque(mi.UInt32, self.leaves)  # data: one kernel serves all trees
 
-    def walk(self, ray: Any, active: Any, visit: Callable[[Any, tuple], tuple], state: tuple, *,
-             any_hit: bool = False) -> tuple:  # fmt: skip
+    def walk(
+        self,
+        ray: mi.Ray3f,
+        active: mi.Bool,
+        visit: Callable[[mi.UInt32, tuple], tuple],
+        state: tuple,
+        *,
+        any_hit: bool = False,
+    ) -> tuple:
         """Call ``visit(leaf, state)`` at each leaf whose box a ray meets; return the last state.
 
         The first of ``state`` is the reach of the ray; ``visit`` returns a new state, with the distance of a
@@ -55,30 +62,33 @@ class Tree:
         rows = [mi.UInt32(2 * axis) + dr.select(ray.d[axis] < 0, mi.UInt32(1), 0) for axis in range(3)]
         reach = state[0]
 
-        def down(node: Any, waiting: Any, reach: Any) -> tuple[Any, Any, Any]:
+        def down(node: mi.UInt32, waiting: mi.UInt32, reach: mi.Float) -> tuple:
             near, far = self._children(node, inverse, shift, rows)
             meets = [(n <= f) & (n <= reach) for n, f in zip(near, far, strict=True)]
             second_first = meets[1] & (~meets[0] | (near[1] < near[0]))
             child = (node << 1) | dr.select(second_first, mi.UInt32(1), 0)
             waiting_below = (waiting << 1) | dr.select(meets[0] & meets[1], mi.UInt32(1), 0)
-            up = _to_next(node, waiting)
+            next_node, next_waiting = _to_next(node, waiting)
             deeper = meets[0] | meets[1]
-            return dr.select(deeper, child, up[0]), dr.select(deeper, waiting_below, up[1]), reach
+            node = dr.select(deeper, child, next_node)
+            waiting = dr.select(deeper, waiting_below, next_waiting)
+            return node, waiting, reach
 
-        def to_next_leaf(node: Any, waiting: Any, state: tuple) -> tuple[Any, Any, tuple]:
+        def above_leaves(node: mi.UInt32, *_: object) -> mi.Bool:
+            return (node != 0) & (node < self.first_leaf)
+
+        def pass_by(leaf: mi.UInt32, state: tuple) -> tuple:
+            return state
+
+        def to_next_leaf(node: mi.UInt32, waiting: mi.UInt32, state: tuple) -> tuple:
             # All rays of a packet go on to a leaf each before any is looked into: that costs ten times a box
-            node, waiting, _ = dr.while_loop(
-                (node, waiting, state[0]),
-                lambda node, *_: (node != 0) & (node < self.first_leaf),
-                down,
-                label="boxes",
-            )
-            found = node != 0
+            start = node, waiting, state[0]
+            node, waiting, _ = dr.while_loop(start, above_leaves, down, label="boxes")
             leaf = node - self.first_leaf
-            state = dr.if_stmt((leaf, state), found, visit, lambda leaf, state: state, label="leaf")
+            state = dr.if_stmt((leaf, state), node != 0, visit, pass_by, label="leaf")
             return *_to_next(node, waiting), state
 
-        def goes_on(node: Any, waiting: Any, state: tuple) -> Any:
+        def goes_on(node: mi.UInt32, waiting: mi.UInt32, state: tuple) -> mi.Bool:
             going = node != 0
             return going & (state[0] >= reach) if any_hit else going
 
@@ -86,24 +96,28 @@ class Tree:
         start = dr.select(known, mi.UInt32(1), 0), mi.UInt32(0), state
         return dr.while_loop(start, goes_on, to_next_leaf, label="tree")[2]
 
-    def _children(self, node: Any, inverse: list, shift: list, rows: list) -> tuple[list, list]:
+    def _children(self, node: mi.UInt32, inverse: list, shift: list, rows: list) -> tuple[list, list]:
         """Return where a ray enters and leaves the boxes of both children."""
-        near, far = [mi.Float(0), mi.Float(0)], [mi.Float(dr.inf), mi.Float(dr.inf)]
+        near = [mi.Float(0), mi.Float(0)]
+        far = [mi.Float(dr.inf), mi.Float(dr.inf)]
         for axis in range(3):
             first0, first1, last0, last1 = dr.gather(mi.Vector4f, self.boxes, 6 * node + rows[axis])
             for child, (first, last) in enumerate(((first0, last0), (first1, last1))):
-                enter, leave = (dr.fma(plane, inverse[axis], shift[axis]) for plane in (first, last))
+                enter = dr.fma(first, inverse[axis], shift[axis])
+                leave = dr.fma(last, inverse[axis], shift[axis])
                 # One instruction each, where dr.maximum and dr.minimum take more to pass on NaN
                 near[child] = dr.select(enter > near[child], enter, near[child])
                 far[child] = dr.select(leave < far[child], leave, far[child])
         return near, [f * (1 + _SLACK) for f in far]
 
 
-def _to_next(node: Any, waiting: Any) -> tuple[Any, Any]:
+def _to_next(node: mi.UInt32, waiting: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
     """Return the next child that waits, and what waits then; node 0 if none does."""
     levels = dr.tzcnt(waiting)
     done = waiting == 0
-    return dr.select(done, 0, (node >> levels) ^ 1), dr.select(done, 0, (waiting >> levels) ^ 1)
+    node = dr.select(done, 0, (node >> levels) ^ 1)
+    waiting = dr.select(done, 0, (waiting >> levels) ^ 1)
+    return node, waiting
 
 
 def _sort(centers: np.ndarray, depth: int) -> np.ndarray:
@@ -115,7 +129,8 @@ def _sort(centers: np.ndarray, depth: int) -> np.ndarray:
         inside = centers[order]
         extent = np.maximum.reduceat(inside, starts) - np.minimum.reduceat(inside, starts)
         axis = np.repeat(extent.argmax(axis=1), np.diff(starts, append=len(centers)))
-        order = order[np.lexsort((inside[np.arange(len(centers)), axis], segment))]
+        place = inside[np.arange(len(centers)), axis]
+        order = order[np.lexsort((place, segment))]
     return order
 
 
@@ -125,16 +140,21 @@ def _heap(boxes: np.ndarray, leaf_of: np.ndarray, leaves: int) -> np.ndarray:
     Along each axis both lower ends and both upper ends; then, for rays that run backwards, the upper ends
     first. Empty boxes are inside out, which no ray meets.
     """
-    low, high = np.full((2 * leaves, 3), np.inf), np.full((2 * leaves, 3), -np.inf)
+    low = np.full((2 * leaves, 3), np.inf)
+    high = -low
     margin = _SLACK * np.abs(boxes).max(axis=(1, 2))[:, None]
     low[leaves + leaf_of] = boxes[:, 0] - margin
     high[leaves + leaf_of] = boxes[:, 1] + margin
     size = leaves
     while size > 1:
         size //= 2
-        low[size : 2 * size] = low[2 * size : 4 * size].reshape(size, 2, 3).min(axis=1)
-        high[size : 2 * size] = high[2 * size : 4 * size].reshape(size, 2, 3).max(axis=1)
+        own = slice(size, 2 * size)
+        below = slice(2 * size, 4 * size)
+        low[own] = low[below].reshape(size, 2, 3).min(axis=1)
+        high[own] = high[below].reshape(size, 2, 3).max(axis=1)
     largest = np.finfo(np.float32).max / 4
     ends = np.stack([low, high]).clip(-largest, largest).reshape(2, leaves, 2, 3)  # end, node, child, axis
     forwards = ends.transpose(1, 3, 0, 2)  # node, axis, end, child
-    return np.stack([forwards, forwards[:, :, ::-1]], axis=2).reshape(leaves, 3, 2, 4).astype(np.float32)
+    backwards = forwards[:, :, ::-1]
+    heap = np.stack([forwards, backwards], axis=2).reshape(leaves, 3, 2, 4)
+    return heap.astype(np.float32)

@@ -19,12 +19,12 @@ def is_jit() -> bool:
     return not mi.variant().startswith("scalar")
 
 
-def pointer(kind: str, objects: Any) -> Any:
+def pointer(kind: str, objects: list[mi.Emitter] | mi.Emitter) -> mi.EmitterPtr:
     """Return an array of pointers to objects (``kind`` "Shape", ...); in scalar variants, the objects."""
     return getattr(mi, kind + "Ptr")(objects) if is_jit() else objects
 
 
-def first(value: Any) -> float:
+def first(value: mi.Float) -> float:
     """Return the first entry of a Dr.Jit array, or the number itself, as a Python float."""
     return float(value) if isinstance(value, float) else float(value[0])
 
@@ -39,7 +39,7 @@ def but_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
     return mask & ~excluded if is_jit() else mask and not excluded
 
 
-def varies(value: Any) -> bool:
+def varies(value: object) -> bool:
     """Return whether a value is a texture that may vary over a surface.
 
     ``mesh_attribute`` denies it, and what somebody else wrote in Python need not say so.
@@ -78,7 +78,7 @@ def construct_quietly(integrator: mi.SamplingIntegrator, props: mi.Properties) -
         mi.set_log_level(level)
 
 
-def aligned(values: np.ndarray, kind: Any = np.float32) -> Any:
+def aligned(values: np.ndarray, kind: type = np.float32) -> mi.Float:
     """Return numbers as a flat array, of float32 or uint32, at a multiple of 64 bytes.
 
     Dr.Jit uses arrays of numpy where they lie, and most lie elsewhere. Only from aligned ones does a kernel
@@ -86,13 +86,14 @@ def aligned(values: np.ndarray, kind: Any = np.float32) -> Any:
     kernels would be compiled and kept.
     """
     size = np.size(values)
-    room = np.empty(size + 16, kind)
-    first = -room.ctypes.data % 64 // 4
-    room[first : first + size] = np.ravel(values)
-    return (mi.Float if kind is np.float32 else mi.UInt32)(room[first : first + size])
+    room: np.ndarray = np.empty(size + 16, kind)
+    start = -room.ctypes.data % 64 // 4
+    place = room[start : start + size]
+    place[:] = np.ravel(values)
+    return mi.Float(place) if kind is np.float32 else mi.UInt32(place)
 
 
-def shape_ids(shapes: Any) -> mi.UInt32:
+def shape_ids(shapes: Sequence[mi.Shape]) -> mi.UInt32:
     """Return Dr.Jit's numbers of shapes.
 
     Of pointers that a recorded kernel reads, it would look at all objects of all scenes at each launch.
@@ -104,7 +105,8 @@ class Table:
     """Rows of numbers, or shapes (``kind`` "Shape"), looked up by index."""
 
     def __init__(self, kind: Any, rows: Any) -> None:
-        self.kind, self.rows = kind, rows
+        self.kind = kind
+        self.rows = rows
         if not is_jit():
             self.rows = rows if kind == "Shape" else [kind([float(x) for x in row]) for row in rows]
         else:
@@ -125,7 +127,9 @@ class ByShape:
     In vectorised variants, a row may have several parts of a kind's width.
     """
 
-    def __init__(self, kind: Any, shapes: Sequence[mi.Shape], rows: Sequence[Any], fallback: Any) -> None:
+    def __init__(
+        self, kind: type, shapes: Sequence[mi.Shape], rows: Sequence, fallback: float | list[float]
+    ) -> None:
         self.kind = kind
         self.fallback = kind(fallback)
         if not is_jit():

@@ -115,7 +115,8 @@ class MrtWhitted(mi.SamplingIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        before, self._rendering = self._rendering, self.prepare(scene)
+        before = self._rendering
+        self._rendering = self.prepare(scene)
         # Mitsuba calls this under a handler of Ctrl-C that would take itself for the one before it. Only the
         # main thread may set one, and only one of Python's
         with contextlib.suppress(ValueError, TypeError):
@@ -184,8 +185,10 @@ class MrtWhitted(mi.SamplingIntegrator):
                 data, scene, s["sampler"], s["ray"], hit, s["throughput"], s["active"]
             )
             # Finite, as an infinite one times no light would be NaN
-            throughput, depth = dr.minimum(s["throughput"] * reflectance, LARGEST), s["depth"] + cost
-            affordable, brightest = depth < self.max_depth, dr.max(throughput)
+            throughput = dr.minimum(s["throughput"] * reflectance, LARGEST)
+            depth = s["depth"] + cost
+            affordable = depth < self.max_depth
+            brightest = dr.max(throughput)
             if data.plan.cut_off[0] == math.inf:
                 goes_on = affordable & (brightest > 0)
             else:
@@ -254,8 +257,10 @@ class MrtWhitted(mi.SamplingIntegrator):
             label="surface",
         )
         if data.plan.sky != "none":
-            si, missed = dr.zeros(mi.SurfaceInteraction3f), but_not(active, hit.found)
-            si.wi, si.wavelengths = -ray.d, ray.wavelengths
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.wi = -ray.d
+            si.wavelengths = ray.wavelengths
+            missed = but_not(active, hit.found)
             sky = self.sky if data.plan.sky == "parameter" else data.environment
             radiance += dr.select(missed, mi.unpolarized_spectrum(sky.eval(si, missed)), 0)
         return radiance, *others
@@ -268,7 +273,10 @@ class MrtWhitted(mi.SamplingIntegrator):
         hit: Hit,
         throughput: mi.UnpolarizedSpectrum,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32]:
-        plan, si, radiance, shadow_rays = data.plan, hit.si, mi.UnpolarizedSpectrum(0), mi.UInt32(0)
+        plan = data.plan
+        si = hit.si
+        radiance = mi.UnpolarizedSpectrum(0)
+        shadow_rays = mi.UInt32(0)
         emitter = si.emitter(scene, hit.found) if plan.emission else None
         if emitter is not None:  # as it is of most surfaces in scalar variants
             radiance += mi.unpolarized_spectrum(emitter.eval(si, hit.found))
@@ -277,7 +285,8 @@ class MrtWhitted(mi.SamplingIntegrator):
             """Return direction to a light, locally too, what may arrive from it, and if on the lit side."""
             u = sampler.next_2d(hit.found) if plan.random else mi.Point2f(0.5)
             ds, arriving = data.lights.sample(light, si, u, hit.found)
-            wo, facing = si.to_local(ds.d), hit.found & (ds.pdf > 0)
+            wo = si.to_local(ds.d)
+            facing = hit.found & (ds.pdf > 0)
             if not plan.two_sided:
                 facing &= mi.Frame3f.cos_theta(wo) > 0
             return ds, wo, mi.unpolarized_spectrum(arriving), facing
@@ -291,7 +300,8 @@ class MrtWhitted(mi.SamplingIntegrator):
             share = dr.max(dr.abs(throughput * value))
             traced = facing & (share * plan.cut_off[1] > self.min_contribution)
             visible = but_not(facing, data.occluded(scene, hit, light, ds, traced))
-            return dr.select(visible, value, 0), dr.select(traced, mi.UInt32(1), mi.UInt32(0))
+            value = dr.select(visible, value, 0)
+            return value, dr.select(traced, mi.UInt32(1), mi.UInt32(0))
 
         samples = [sampled(light, sampler) for light in range(data.lights.unrolled)]
         values, reflectance, int_ior = data.eval_bsdf(
@@ -299,7 +309,8 @@ class MrtWhitted(mi.SamplingIntegrator):
         )
         for light, (sample, value) in enumerate(zip(samples, values, strict=True)):
             light_here, traced = lit(light, sample, value)
-            radiance, shadow_rays = radiance + light_here, shadow_rays + traced
+            radiance = radiance + light_here
+            shadow_rays = shadow_rays + traced
 
         def step(light: mi.UInt32, radiance: Any, shadow_rays: Any, sampler: mi.Sampler) -> tuple:
             sample = sampled(light, sampler)
@@ -314,5 +325,6 @@ class MrtWhitted(mi.SamplingIntegrator):
             )
         cost = mi.UInt32(1)
         if self.bounce_budget == "report":
-            cost = mi.UInt32(dr.maximum(10 - mi.Int32(dr.minimum(10 * int_ior, 10)), 1))
+            tenths = mi.Int32(dr.minimum(10 * int_ior, 10))
+            cost = mi.UInt32(dr.maximum(10 - tenths, 1))
         return radiance, shadow_rays, reflectance, cost
