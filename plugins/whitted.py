@@ -246,23 +246,28 @@ class MrtWhitted(mi.SamplingIntegrator):
         ``throughput`` is that of the path up to ``hit``.
         """
 
+        def missed(hit: Hit, path: mi.UnpolarizedSpectrum, sampler: mi.Sampler) -> tuple:
+            # Dr.Jit writes results into what a branch returns, and runs branches anew for derivatives: two
+            # objects, made here
+            black, no_mirror = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(0)
+            return (black, mi.UInt32(0), no_mirror, mi.UInt32(0)), sampler
+
         # A branch, because packets whose rays all miss are many
         state = hit, throughput, sampler if data.plan.random else None
-        black = mi.UnpolarizedSpectrum(0)
         (radiance, *others), _ = dr.if_stmt(
             state,
             hit.found,
             lambda hit, path, sampler: (self._shade_surface(data, scene, sampler, hit, path), sampler),
-            lambda hit, path, sampler: ((black, mi.UInt32(0), black, mi.UInt32(0)), sampler),
+            missed,
             label="surface",
         )
         if data.plan.sky != "none":
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.wi = -ray.d
             si.wavelengths = ray.wavelengths
-            missed = but_not(active, hit.found)
+            away = but_not(active, hit.found)
             sky = self.sky if data.plan.sky == "parameter" else data.environment
-            radiance += dr.select(missed, mi.unpolarized_spectrum(sky.eval(si, missed)), 0)
+            radiance += dr.select(away, mi.unpolarized_spectrum(sky.eval(si, away)), 0)
         return radiance, *others
 
     def _shade_surface(
