@@ -8,12 +8,7 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
-from mrt_mitsuba.validation.checks.law import (
-    Figure,
-    Law,
-    Skip,
-    figures,
-)
+from mrt_mitsuba.validation.checks.law import Law, Skip, at_most, figures, most, number_of
 from mrt_mitsuba.validation.checks.probe import Array, Probe, context, excess
 
 FLAGS = "print([hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())], hex(int(bsdf.flags())))\n"
@@ -35,61 +30,28 @@ SELECTS = "ctx.type_mask selects lobes: integrators that treat some apart count 
 
 
 @figures(
-    flags=Figure(
+    flags=at_most(
         "flags of the whole that no component has, or the other way around",
-        statistic="at most",
-        limit=0,
-        why="flags() is the union of flags(i)",
-        snippet=FLAGS,
+        0,
+        "flags() is the union of flags(i)",
+        FLAGS,
     ),
-    updated=Figure(
-        "components more or fewer after params.update()",
-        statistic="at most",
-        limit=0,
-        why="an update says nothing about lobes",
-        snippet=UPDATED,
+    updated=at_most(
+        "components more or fewer after params.update()", 0, "an update says nothing about lobes", UPDATED
     ),
-    sum=Figure(
-        "sum of the components against the whole, relative",
-        statistic="most",
-        limit=1e-4,
-        why="a sum",
-        snippet=VALUE,
+    sum=most("sum of the components against the whole, relative", 1e-4, "a sum", VALUE),
+    values=number_of("results of eval() that contradict the flags of component {component}", 0, SIDES, VALUE),
+    samples=number_of(
+        "results of sample() that contradict the flags of component {component}", 0, SIDES, FLAGS + SAMPLE
     ),
-    values=Figure(
-        "results of eval() that contradict the flags of component {component}",
-        statistic="none",
-        limit=0,
-        why=SIDES,
-        snippet=VALUE,
+    dark=at_most(
+        "sides that a component's flags name, and from which it is black", 0, "a flag without a lobe", FLAGS
     ),
-    samples=Figure(
-        "results of sample() that contradict the flags of component {component}",
-        statistic="none",
-        limit=0,
-        why=SIDES,
-        snippet=FLAGS + SAMPLE,
+    masked=most(
+        "value of lobes of type {mask:#x} against the sum of such components, relative", 1e-4, SELECTS, MASKED
     ),
-    dark=Figure(
-        "sides that a component's flags name, and from which it is black",
-        statistic="at most",
-        limit=0,
-        why="a flag without a lobe",
-        snippet=FLAGS,
-    ),
-    masked=Figure(
-        "value of lobes of type {mask:#x} against the sum of such components, relative",
-        statistic="most",
-        limit=1e-4,
-        why=SELECTS,
-        snippet=MASKED,
-    ),
-    masked_samples=Figure(
-        "samples and densities of lobes that the mask of types {mask:#x} leaves out",
-        statistic="none",
-        limit=0,
-        why=SELECTS,
-        snippet=MASKED,
+    masked_samples=number_of(
+        "samples and densities of lobes that the mask of types {mask:#x} leaves out", 0, SELECTS, MASKED
     ),
 )
 def components(law: Law, case: Case) -> None:
@@ -174,12 +136,11 @@ def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
 
 
 @figures(
-    same=Figure(
+    same=most(
         "value and density in {other} against {here}, relative, beyond rounding",
-        statistic="most",
-        limit=POINTWISE,
-        why="the same formula",
-        snippet=VALUE,
+        POINTWISE,
+        "the same formula",
+        VALUE,
     )
 )
 def variants(law: Law, case: Case) -> None:
@@ -208,12 +169,11 @@ def variants(law: Law, case: Case) -> None:
 
 
 @figures(
-    same=Figure(
+    same=most(
         "values of the BSDF {which} after a switch to {other} and back, relative, beyond rounding",
-        statistic="most",
-        limit=1e-4,
-        why="the same formula with the same numbers",
-        snippet=VALUE,
+        1e-4,
+        "the same formula with the same numbers",
+        VALUE,
     )
 )
 def switch(law: Law, case: Case) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.bsdf_case import Case, affine, changed, live, narrow, parameters
-from mrt_mitsuba.validation.checks.law import SIGMAS, Figure, Law, Skip, figures
+from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, at_most, figures, most, number_of
 from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
@@ -56,41 +56,36 @@ print("after an update to {number}:", bsdf.eval(ctx, si, wo), "should be", {valu
 
 
 @figures(
-    values=Figure(
+    values=at_most(
         "derivative of values by {key}{how}, relative, beyond the error of differences",
-        statistic="at most",
-        limit=GRADIENT,
-        why=f"{BIASED}; differences of two widths agree better, or the difference is allowed for",
-        snippet=DERIVATIVE,
+        GRADIENT,
+        f"{BIASED}; differences of two widths agree better, or the difference is allowed for",
+        DERIVATIVE,
     ),
-    broken=Figure(
+    broken=number_of(
         "derivatives by {key} that are not finite, of finite values",
-        statistic="none",
-        limit=0,
-        why="one of them spoils a whole gradient",
-        snippet=DERIVATIVE,
+        0,
+        "one of them spoils a whole gradient",
+        DERIVATIVE,
     ),
-    mean=Figure(
+    mean=at_most(
         "mean derivative of weights by {key}, of directions that move with it, against that of "
         f"values, relative, beyond {SIGMAS} standard errors",
-        statistic="at most",
-        limit=IN_THE_MEAN,
-        why=DETACHED,
-        snippet=SAMPLED,
+        IN_THE_MEAN,
+        DETACHED,
+        SAMPLED,
     ),
-    weights=Figure(
+    weights=at_most(
         "derivative of weights by {key} against that of eval() over a constant density, relative",
-        statistic="at most",
-        limit=GRADIENT,
-        why=DETACHED,
-        snippet=SAMPLED,
+        GRADIENT,
+        DETACHED,
+        SAMPLED,
     ),
-    reached=Figure(
+    reached=most(
         "values that loading with another {key} changes, but params.update() does not, relative",
-        statistic="most",
-        limit=GRADIENT,
-        why=f"{BIASED}; parameters_changed() has to compute anew what is made of parameters",
-        snippet=UPDATE,
+        GRADIENT,
+        f"{BIASED}; parameters_changed() has to compute anew what is made of parameters",
+        UPDATE,
     ),
 )
 def gradients(law: Law, case: Case) -> None:

@@ -8,13 +8,7 @@ from scipy import stats
 from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, live, narrow
 from mrt_mitsuba.validation.checks.bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
-from mrt_mitsuba.validation.checks.law import (
-    SIGMAS,
-    Figure,
-    Law,
-    figures,
-    rare,
-)
+from mrt_mitsuba.validation.checks.law import SIGMAS, Law, at_most, figures, most, rare, share_of
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar
 from mrt_mitsuba.validation.checks.sphere import (
     Cells,
@@ -39,28 +33,25 @@ FITS = "rational fits of Smith's G1 in use are off by 0.35 %"
 
 @figures(
     cells=rare("least chance of counts at {angles} angles if samples follow pdf(), for their number", CELL),
-    integral=Figure(
+    integral=most(
         f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} standard errors",
-        statistic="most",
-        limit=FIT,
-        why=FITS,
-        snippet=WHOLE,
+        FIT,
+        FITS,
+        WHOLE,
     ),
     small=rare("chance of such counts of all angles in cells of a degree, for their number", CELL),
     slices=rare("chance of such counts of all angles in slices of a degree or two, for their number", WHOLE),
-    still=Figure(
+    still=share_of(
         "share of samples that stay where two of their random numbers move by 2^-18",
-        statistic="share",
-        limit=0.05,
-        why="directions fill the sphere, in two dimensions; stairs in random numbers show as patterns",
-        snippet=NUDGED,
+        0.05,
+        "directions fill the sphere, in two dimensions; stairs in random numbers show as patterns",
+        NUDGED,
     ),
-    dark=Figure(
+    dark=at_most(
         "share of the light that comes from directions whose pdf() is 0",
-        statistic="at most",
-        limit=1e-4,
-        why="light that samples never find is missing from the picture",
-        snippet=VALUE,
+        1e-4,
+        "light that samples never find is missing from the picture",
+        VALUE,
     ),
 )
 def sampling(law: Law, case: Case) -> None:
@@ -149,26 +140,13 @@ def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
 
 
 @figures(
-    density=Figure(
-        f"density of a sample against pdf(), {BEYOND}",
-        statistic="most",
-        limit=POINTWISE,
-        why=AGAIN,
-        snippet=SAMPLE,
-    ),
-    weight=Figure(
-        f"weight of a sample against eval() / pdf(), {BEYOND}",
-        statistic="most",
-        limit=POINTWISE,
-        why=AGAIN,
-        snippet=SAMPLE,
-    ),
-    discrete=Figure(
+    density=most(f"density of a sample against pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
+    weight=most(f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
+    discrete=most(
         f"probability of a single direction (delta) less its share, beyond {SIGMAS} standard errors",
-        statistic="most",
-        limit=POINTWISE,
-        why="a count",
-        snippet=WHOLE,
+        POINTWISE,
+        "a count",
+        WHOLE,
     ),
 )
 def weights(law: Law, case: Case) -> None:
@@ -212,19 +190,17 @@ def _discrete(s: Lanes) -> list[float]:
 
 
 @figures(
-    largest=Figure(
+    largest=most(
         f"largest albedo, less {SIGMAS} standard errors",
-        statistic="most",
-        limit=1 + FIT,
-        why="no more light leaves than arrives; 0.5 % for fits of G1",
-        snippet=WHOLE,
+        1 + FIT,
+        "no more light leaves than arrives; 0.5 % for fits of G1",
+        WHOLE,
     ),
-    apart=Figure(
+    apart=most(
         f"albedo by quadrature of eval() against mean weight, relative, beyond {SIGMAS} standard errors",
-        statistic="most",
-        limit=2 * FIT,
-        why="0.5 % for fits of G1 in the density",
-        snippet=WHOLE,
+        2 * FIT,
+        "0.5 % for fits of G1 in the density",
+        WHOLE,
     ),
 )
 def energy(law: Law, case: Case) -> None:

@@ -12,38 +12,20 @@ import numpy as np
 from mrt_mitsuba.validation.checks import bsdf_case, noise, probe
 from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
-from mrt_mitsuba.validation.checks.law import (
-    Figure,
-    Law,
-    Skip,
-    figures,
-)
+from mrt_mitsuba.validation.checks.law import Figure, Law, Skip, at_least, at_most, figures, most, number_of
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar
 
 TWO_WAYS = "two ways to the same number"
 
 
 @figures(
-    value=Figure(
-        f"value of eval_pdf() against that of eval(), {BEYOND}",
-        statistic="most",
-        limit=1e-4,
-        why=TWO_WAYS,
-        snippet=VALUE,
-    ),
-    density=Figure(
-        f"density of eval_pdf() against that of pdf(), {BEYOND}",
-        statistic="most",
-        limit=1e-4,
-        why=TWO_WAYS,
-        snippet=VALUE,
-    ),
-    inactive=Figure(
+    value=most(f"value of eval_pdf() against that of eval(), {BEYOND}", 1e-4, TWO_WAYS, VALUE),
+    density=most(f"density of eval_pdf() against that of pdf(), {BEYOND}", 1e-4, TWO_WAYS, VALUE),
+    inactive=number_of(
         "values that are not 0 where active is False",
-        statistic="none",
-        limit=0,
-        why="a sum over lanes must not hold those that are switched off",
-        snippet=VALUE,
+        0,
+        "a sum over lanes must not hold those that are switched off",
+        VALUE,
     ),
 )
 def eval_pdf(law: Law, case: Case) -> None:
@@ -84,47 +66,28 @@ EITHER_WAY = "light can be followed either way; transmitted radiance scales by t
 
 
 @figures(
-    swapped=Figure(
-        f"f(wi, wo) against f(wo, wi), {BEYOND}",
-        statistic="most",
-        limit=POINTWISE,
-        why=EITHER_WAY,
-        snippet=RECIPROCITY,
+    swapped=most(f"f(wi, wo) against f(wo, wi), {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY),
+    modes=most(
+        f"f in the mode of radiance against that of importance, {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY
     ),
-    modes=Figure(
-        f"f in the mode of radiance against that of importance, {BEYOND}",
-        statistic="most",
-        limit=POINTWISE,
-        why=EITHER_WAY,
-        snippet=RECIPROCITY,
-    ),
-    medium=Figure(
-        "index of refraction of reflected samples, less 1",
-        statistic="most",
-        limit=probe.ROUNDED,
-        why="one medium",
-        snippet=SAMPLE,
-    ),
-    returns=Figure(
+    medium=most("index of refraction of reflected samples, less 1", probe.ROUNDED, "one medium", SAMPLE),
+    returns=at_least(
         "share of single directions (delta) that the way back returns to",
-        statistic="at least",
-        limit=0.05,
-        why="light can be followed either way; of several directions, the way back may draw another",
-        snippet=THERE_AND_BACK,
+        0.05,
+        "light can be followed either way; of several directions, the way back may draw another",
+        THERE_AND_BACK,
     ),
-    single=Figure(
+    single=most(
         f"probability x weight x eta^2 of a single direction (delta) against the way back, {BEYOND}",
-        statistic="most",
-        limit=POINTWISE,
-        why=EITHER_WAY,
-        snippet=THERE_AND_BACK,
+        POINTWISE,
+        EITHER_WAY,
+        THERE_AND_BACK,
     ),
-    single_modes=Figure(
+    single_modes=most(
         "weight of a single direction (delta) x eta^2 against the mode of importance, relative",
-        statistic="most",
-        limit=POINTWISE,
-        why=EITHER_WAY,
-        snippet=THERE_AND_BACK,
+        POINTWISE,
+        EITHER_WAY,
+        THERE_AND_BACK,
     ),
 )
 def reciprocity(law: Law, case: Case) -> None:
@@ -203,14 +166,13 @@ SPOILS = "one such number spoils a picture"
 
 
 @figures(
-    values=Figure(WRONG, statistic="none", limit=0, why=SPOILS, snippet=VALUE),
-    samples=Figure(WRONG, statistic="none", limit=0, why=SPOILS, snippet=SAMPLE),
-    million=Figure(
+    values=number_of(WRONG, 0, SPOILS, VALUE),
+    samples=number_of(WRONG, 0, SPOILS, SAMPLE),
+    million=at_most(
         "samples of {count} at random whose weight, density or value is not finite, or negative",
-        statistic="at most",
-        limit=0,
-        why=SPOILS,
-        snippet=SAMPLE,
+        0,
+        SPOILS,
+        SAMPLE,
     ),
 )
 def finite(law: Law, case: Case) -> None:
@@ -313,11 +275,11 @@ NOISE = """for k in range(9):  # float32 steps in all components: a smooth funct
 
 @figures(
     lost=Figure(
+        0.9,
         "noise of {function}() over that of 8 roundings with rounded directions, 9 in 10",
-        statistic=0.9,
-        limit=noise.LOST,
-        why="sound formulas stay below 1.6; beyond, digits are lost",
-        snippet=NOISE,
+        noise.LOST,
+        "sound formulas stay below 1.6; beyond, digits are lost",
+        NOISE,
     )
 )
 def roundoff(law: Law, case: Case) -> None:

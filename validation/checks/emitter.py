@@ -19,12 +19,14 @@ from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.law import (
     TIMEOUT,
     Check,
-    Figure,
     Law,
     Skip,
     Subject,
+    at_most,
     examine,
     figures,
+    most,
+    number_of,
     rare,
 )
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, excess, lanes
@@ -179,14 +181,7 @@ def _seen_from(p: mi.Point3f) -> mi.SurfaceInteraction3f:
     return probe.at_wavelengths(it)
 
 
-@figures(
-    same=Figure(
-        f"density of a direction against pdf_direction(), {BEYOND}",
-        statistic="most",
-        limit=SAME,
-        why="one number",
-    )
-)
+@figures(same=most(f"density of a direction against pdf_direction(), {BEYOND}", SAME, "one number"))
 def density(law: Law, case: Case) -> None:
     """The density that a sample states is ``pdf_direction``."""
     s = case.samples
@@ -197,20 +192,16 @@ def density(law: Law, case: Case) -> None:
 
 
 @figures(
-    place=Figure(
-        "sampled point off the stated direction and distance, relative",
-        statistic="most",
-        limit=LENGTH,
-        why="one place, said in two ways",
+    place=most(
+        "sampled point off the stated direction and distance, relative", LENGTH, "one place, said in two ways"
     ),
     counts=rare("chance of such counts if directions follow pdf_direction()"),
     small=rare("chance of such counts in cells of a degree, for their number"),
     slices=rare("chance of such counts in slices of a degree or two, for their number"),
-    dark=Figure(
+    dark=at_most(
         "share of the light, from all around, whose density is 0",
-        statistic="at most",
-        limit=DARK,
-        why="light that samples never find is missing from the picture",
+        DARK,
+        "light that samples never find is missing from the picture",
     ),
 )
 def sampling(law: Law, case: Case) -> None:
@@ -290,18 +281,8 @@ def _directions(case: Case, u: Array) -> Array:
 
 
 @figures(
-    weight=Figure(
-        f"weight against eval_direction() / density, {BEYOND}",
-        statistic="most",
-        limit=SAME,
-        why="one number",
-    ),
-    seen=Figure(
-        f"eval() where it is seen against eval_direction(), {BEYOND}",
-        statistic="most",
-        limit=SAME,
-        why="one number",
-    ),
+    weight=most(f"weight against eval_direction() / density, {BEYOND}", SAME, "one number"),
+    seen=most(f"eval() where it is seen against eval_direction(), {BEYOND}", SAME, "one number"),
 )
 def weights(law: Law, case: Case) -> None:
     """weight · pdf = ``eval_direction`` = what is seen there."""
@@ -317,17 +298,11 @@ def weights(law: Law, case: Case) -> None:
 
 
 @figures(
-    bad=Figure(
-        "samples that are not finite, or negative, or not of unit length",
-        statistic="none",
-        limit=0,
-        why=SPOILS,
-    ),
-    million=Figure(
+    bad=number_of("samples that are not finite, or negative, or not of unit length", 0, SPOILS),
+    million=at_most(
         "samples of {count} from one point whose weight, density or direction is not finite, or negative",
-        statistic="at most",
-        limit=0,
-        why=SPOILS,
+        0,
+        SPOILS,
     ),
 )
 def finite(law: Law, case: Case) -> None:

@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from textwrap import indent
 from typing import Any, TypeVar
@@ -54,16 +55,24 @@ class TimedOut(BaseException):
 class Figure:
     """What a law measures, and the limit that it is held to.
 
-    ``statistic``: a number "at most" or "at least" the limit; or, of N errors, the "most", "none" or the
+    ``statistic``: a number "at most" or "at least" the limit; or, of N errors, the "most", the "count" or the
     "share" of those that are wrong, or a quantile (a float) without NaN. ``what`` and ``snippet``, the body
     of a program that shows the worst case, have places for the names given to ``Law.hold``.
     """
 
-    what: str
     statistic: str | float
+    what: str
     limit: float
     why: str
     snippet: str = ""
+
+
+# A figure by its statistic: what it is, its limit, the reason for that, and a snippet
+at_most = partial(Figure, "at most")
+at_least = partial(Figure, "at least")
+most = partial(Figure, "most")
+number_of = partial(Figure, "count")
+share_of = partial(Figure, "share")
 
 
 @dataclass(frozen=True)
@@ -86,7 +95,7 @@ def figures(**rows: Figure) -> Callable[[Found], Found]:
 
 def rare(what: str, snippet: str = "") -> Figure:
     """The chance of what was seen, if a plugin is sound."""
-    return Figure(what, statistic="at least", limit=LEVEL, why=ONE_IN_A_MILLION, snippet=snippet)
+    return at_least(what, LEVEL, ONE_IN_A_MILLION, snippet)
 
 
 @dataclass
@@ -184,7 +193,7 @@ def _summary(errors: Array, statistic: str | float) -> tuple[float, int]:
         quantile = np.nanquantile(errors, statistic)
         return quantile, int(np.nanargmin(np.abs(errors - quantile)))
     worst = int(np.where(np.isnan(errors), np.inf, errors).argmax())
-    if statistic == "none":
+    if statistic == "count":
         return errors.sum(), worst
     if statistic == "share":
         return errors.mean(), worst

@@ -16,7 +16,11 @@ from mrt_mitsuba.validation.checks.law import (
     Figure,
     Law,
     Skip,
+    at_most,
     figures,
+    most,
+    number_of,
+    share_of,
 )
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import (
@@ -53,20 +57,8 @@ ONE = "one question, one answer; of rays that graze, only those that just miss c
 
 
 @figures(
-    ray_test=Figure(
-        "share of rays {rays} on which ray_test() is wrong",
-        statistic="share",
-        limit=0,
-        why=ONE,
-        snippet=MAXT,
-    ),
-    ray_intersect=Figure(
-        "share of rays {rays} on which ray_intersect() is wrong",
-        statistic="share",
-        limit=0,
-        why=ONE,
-        snippet=MAXT,
-    ),
+    ray_test=share_of("share of rays {rays} on which ray_test() is wrong", 0, ONE, MAXT),
+    ray_intersect=share_of("share of rays {rays} on which ray_intersect() is wrong", 0, ONE, MAXT),
 )
 def hits(law: Law, case: Case) -> None:
     """``ray_test`` and ``ray_intersect`` agree, and respect ``maxt``, from outside and from the surface."""
@@ -98,48 +90,45 @@ def _answers(law: Law, case: Case, rays: str, traced: tuple[Array, Array, Lanes]
 
 
 @figures(
-    on_ray=Figure(
+    on_ray=most(
         "hit point off the ray at its distance, in roundings of the largest number",
-        statistic="most",
-        limit=HIT_ROUNDINGS,
-        why="some dozen operations",
-        snippet=RAY,
+        HIT_ROUNDINGS,
+        "some dozen operations",
+        RAY,
     ),
     near_by=Figure(
+        0.5,
         "hit point off a ray of a twentieth of the size, in roundings of the largest coordinate, median",
-        statistic=0.5,
-        limit=TYPICAL,
-        why="a few operations",
-        snippet=RAY,
+        TYPICAL,
+        "a few operations",
+        RAY,
     ),
     behind=Figure(
+        0.5,
         "hit points from in front and from behind, across the surface, in roundings of the largest "
         "coordinate, median",
-        statistic=0.5,
-        limit=TYPICAL,
-        why="a few operations",
-        snippet=RAY,
+        TYPICAL,
+        "a few operations",
+        RAY,
     ),
-    again=Figure(
+    again=number_of(
         "rays from the surface, of {count}, that meet it where they start",
-        statistic="none",
-        limit=0,
-        why="self-intersections are dark spots; grazing rays are left out",
-        snippet=RAY,
+        0,
+        "self-intersections are dark spots; grazing rays are left out",
+        RAY,
     ),
-    missed=Figure(
+    missed=share_of(
         "share of rays from a thousandth of the size before the surface that do not meet it there",
-        statistic="share",
-        limit=2e-3,
-        why="no absolute limits; outlines hang on roundings",
-        snippet=RAY,
+        2e-3,
+        "no absolute limits; outlines hang on roundings",
+        RAY,
     ),
     noise=Figure(
+        0.9,
         f"noise of the {{what}} over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10",
-        statistic=0.9,
-        limit=noise.LOST,
-        why="digits are lost inside that could be kept",
-        snippet=RAY,
+        noise.LOST,
+        "digits are lost inside that could be kept",
+        RAY,
     ),
 )
 def surface(law: Law, case: Case) -> None:
@@ -233,61 +222,38 @@ PARTED = "extrapolated to no step; edges may part neighbours"
 
 
 @figures(
-    outwards=Figure(
+    outwards=share_of(
         "share of rays from outside whose normal points the wrong way",
-        statistic="share",
-        limit=1e-3,
-        why="a closed shape has an outside; what edges hide is left room for",
-        snippet=RAY,
+        1e-3,
+        "a closed shape has an outside; what edges hide is left room for",
+        RAY,
     ),
-    length=Figure(
-        "length of a normal less 1",
-        statistic="most",
-        limit=1e-5,
-        why="a square root and a quotient",
-        snippet=RAY,
-    ),
-    side=Figure(
-        "shading normals on the other side than the geometric one",
-        statistic="none",
-        limit=0,
-        why="one surface",
-        snippet=RAY,
-    ),
+    length=most("length of a normal less 1", 1e-5, "a square root and a quotient", RAY),
+    side=number_of("shading normals on the other side than the geometric one", 0, "one surface", RAY),
     shading=Figure(
+        0.9,
         "shading normal against the geometric one, except on smoothed meshes, 9 in 10",
-        statistic=0.9,
-        limit=2e-3,
-        why="the same, within some roundings",
-        snippet=RAY,
+        2e-3,
+        "the same, within some roundings",
+        RAY,
     ),
-    turned=Figure(
+    turned=share_of(
         "share of normals that turn where the same point is met from behind",
-        statistic="share",
-        limit=1e-3,
-        why="a surface has one normal; thin parts are left room for",
-        snippet=RAY,
+        1e-3,
+        "a surface has one normal; thin parts are left room for",
+        RAY,
     ),
-    slant=Figure(
+    slant=most(
         "cosine between the normal and a partial derivative of the point",
-        statistic="most",
-        limit=1e-3,
-        why="both are known to a few roundings; near a pole the derivatives are short",
-        snippet=RAY,
+        1e-3,
+        "both are known to a few roundings; near a pole the derivatives are short",
+        RAY,
     ),
     slope=Figure(
-        "slope of the surface against its normal, by differences, 95 in 100",
-        statistic=0.95,
-        limit=1e-2,
-        why=PARTED,
-        snippet=NEIGHBOUR,
+        0.95, "slope of the surface against its normal, by differences, 95 in 100", 1e-2, PARTED, NEIGHBOUR
     ),
     step=Figure(
-        "step along the surface less its partial derivatives, 95 in 100",
-        statistic=0.95,
-        limit=1e-2,
-        why=PARTED,
-        snippet=NEIGHBOUR,
+        0.95, "step along the surface less its partial derivatives, 95 in 100", 1e-2, PARTED, NEIGHBOUR
     ),
 )
 def normals(law: Law, case: Case) -> None:
@@ -343,26 +309,20 @@ def _differences(law: Law, case: Case) -> None:
 
 
 @figures(
-    blind=Figure(
-        "share of rays that pass the surface from behind",
-        statistic="share",
-        limit=1e-2,
-        why="it has two sides; edges have room",
-        snippet=RAY,
+    blind=share_of(
+        "share of rays that pass the surface from behind", 1e-2, "it has two sides; edges have room", RAY
     ),
-    odd=Figure(
+    odd=share_of(
         "share of lines, of {judged}, that cross the surface an odd number of times",
-        statistic="share",
-        limit=1e-3,
-        why="near sharp edges, the offset of a ray that goes on leads out again; grazing lines are left out",
-        snippet=RAY,
+        1e-3,
+        "near sharp edges, the offset of a ray that goes on leads out again; grazing lines are left out",
+        RAY,
     ),
-    out=Figure(
+    out=at_most(
         "share of rays from inside, of {count}, that surely meet nothing",
-        statistic="at most",
-        limit=1e-5,
-        why="a closed surface; of a million rays at triangles, some pass along an edge",
-        snippet=RAY,
+        1e-5,
+        "a closed surface; of a million rays at triangles, some pass along an edge",
+        RAY,
     ),
 )
 def watertight(law: Law, case: Case) -> None:
@@ -411,19 +371,17 @@ print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}
 
 
 @figures(
-    answer=Figure(
+    answer=number_of(
         "rays answered otherwise at 2^{power} of the size",
-        statistic="none",
-        limit=0,
-        why="scaling by a power of two rounds nothing; grazing rays are left out",
-        snippet=SCALED,
+        0,
+        "scaling by a power of two rounds nothing; grazing rays are left out",
+        SCALED,
     ),
-    off=Figure(
+    off=most(
         "distance (relative) or normal at 2^{power} of the size, off",
-        statistic="most",
-        limit=HIT_ROUNDINGS * ROUNDING,
-        why="some dozen operations, on scaled numbers",
-        snippet=SCALED,
+        HIT_ROUNDINGS * ROUNDING,
+        "some dozen operations, on scaled numbers",
+        SCALED,
     ),
 )
 def scale(law: Law, case: Case) -> None:
@@ -458,13 +416,12 @@ TWICE = """for o in (o, mi.Point3f({other})):
 
 
 @figures(
-    missed=Figure(
+    missed=share_of(
         "share of rays from afar that miss what is met from nearby, or meet it "
         f"{HIT_ROUNDINGS} roundings off",
-        statistic="share",
-        limit=1e-3,
-        why="the origin is rounded, and some dozen operations with it; next to edges, more hangs on them",
-        snippet=TWICE,
+        1e-3,
+        "the origin is rounded, and some dozen operations with it; next to edges, more hangs on them",
+        TWICE,
     ),
 )
 def far(law: Law, case: Case) -> None:
@@ -493,19 +450,12 @@ def far(law: Law, case: Case) -> None:
 
 
 @figures(
-    bad=Figure(
-        "hits with numbers that are not finite",
-        statistic="none",
-        limit=0,
-        why="one NaN spoils a picture",
-        snippet=RAY,
-    ),
-    million=Figure(
+    bad=number_of("hits with numbers that are not finite", 0, "one NaN spoils a picture", RAY),
+    million=at_most(
         "hits of {count} rays at random, or sampled positions, with numbers that are not finite",
-        statistic="at most",
-        limit=0,
-        why="one NaN spoils a picture",
-        snippet=RAY,
+        0,
+        "one NaN spoils a picture",
+        RAY,
     ),
 )
 def finite(law: Law, case: Case) -> None:
@@ -558,13 +508,7 @@ def _by_the_million(law: Law, case: Case) -> None:
 
 
 @figures(
-    outside=Figure(
-        "points outside the bounding box, in sizes",
-        statistic="at most",
-        limit=1e-5,
-        why="some roundings",
-        snippet=RAY,
-    ),
+    outside=at_most("points outside the bounding box, in sizes", 1e-5, "some roundings", RAY),
 )
 def bbox(law: Law, case: Case) -> None:
     """Whatever is hit or sampled lies in the bounding box."""
@@ -579,19 +523,12 @@ def bbox(law: Law, case: Case) -> None:
 
 
 @figures(
-    answer=Figure(
-        "share of rays answered otherwise in {other}",
-        statistic="share",
-        limit=2e-3,
-        why="outlines hang on roundings",
-        snippet=RAY,
-    ),
-    distance=Figure(
+    answer=share_of("share of rays answered otherwise in {other}", 2e-3, "outlines hang on roundings", RAY),
+    distance=most(
         "distance in {other}, off by roundings of the largest number",
-        statistic="most",
-        limit=4 * HIT_ROUNDINGS,
-        why="some dozen operations each, and another cosine with the surface",
-        snippet=RAY,
+        4 * HIT_ROUNDINGS,
+        "some dozen operations each, and another cosine with the surface",
+        RAY,
     ),
 )
 def variants(law: Law, case: Case) -> None:

@@ -10,13 +10,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-from mrt_mitsuba.validation.checks.law import (
-    SIGMAS,
-    Figure,
-    Law,
-    figures,
-    rare,
-)
+from mrt_mitsuba.validation.checks.law import SIGMAS, Figure, Law, at_most, figures, most, rare, share_of
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import (
     Array,
@@ -48,66 +42,51 @@ SAME = "the same number"
 
 
 @figures(
-    position=Figure(
-        "density of a position against pdf_position(), relative",
-        statistic="most",
-        limit=1e-3,
-        why=SAME,
-        snippet=POSITIONS,
-    ),
-    area=Figure(
-        "mean of 1 / density against surface_area(), relative",
-        statistic="at most",
-        limit=1e-3,
-        why=SAME,
-        snippet=POSITIONS,
-    ),
+    position=most("density of a position against pdf_position(), relative", 1e-3, SAME, POSITIONS),
+    area=at_most("mean of 1 / density against surface_area(), relative", 1e-3, SAME, POSITIONS),
     off=Figure(
+        0.9,
         "sampled positions off the surface, 9 in 10, in roundings of the largest coordinate",
-        statistic=0.9,
-        limit=2 * HIT_ROUNDINGS,
-        why="a few roundings",
-        snippet=RAY,
+        2 * HIT_ROUNDINGS,
+        "a few roundings",
+        RAY,
     ),
     normal=Figure(
+        0.9,
         "normals of sampled positions against those of rays, 1 - cosine, 9 in 10",
-        statistic=0.9,
-        limit=1e-3,
-        why="one surface",
-        snippet=RAY,
+        1e-3,
+        "one surface",
+        RAY,
     ),
-    crossings=Figure(
+    crossings=at_most(
         f"surface_area() against that by crossings of lines, relative, beyond {SIGMAS} standard errors",
-        statistic="at most",
-        limit=3e-3,
-        why="lines that graze may cross twice within the offset of a spawned ray",
-        snippet=POSITIONS,
+        3e-3,
+        "lines that graze may cross twice within the offset of a spawned ray",
+        POSITIONS,
     ),
     spread=rare("chance of such positions if they follow the area, along the worst of some axes", POSITIONS),
     direction=Figure(
+        0.99,
         "density of a direction against pdf_direction(), relative, 99 in 100",
-        statistic=0.99,
-        limit=1e-2,
-        why="the same number; near outlines the cosine, and the density with it, hangs on roundings",
-        snippet=RAY,
+        1e-2,
+        "the same number; near outlines the cosine, and the density with it, hangs on roundings",
+        RAY,
     ),
-    misses=Figure(
+    misses=share_of(
         "share of sampled directions that miss the shape, or reach it behind the sampled point",
-        statistic="share",
-        limit=1e-2,
-        why="outlines hang on roundings; small leaks are watertight's business",
-        snippet=RAY,
+        1e-2,
+        "outlines hang on roundings; small leaks are watertight's business",
+        RAY,
     ),
     aim=rare(
         "chance of such directions, if they follow their density, from the worst of some places", POSITIONS
     ),
-    angle=Figure(
+    angle=at_most(
         "solid angle of what is visible, or its middle or width, by samples against uniform "
         f"directions, beyond {SIGMAS} standard errors",
-        statistic="at most",
-        limit=1e-2,
-        why="the mean of 1 / density over what is seen; lines that graze are left room for",
-        snippet=POSITIONS,
+        1e-2,
+        "the mean of 1 / density over what is seen; lines that graze are left room for",
+        POSITIONS,
     ),
 )
 def sampling(law: Law, case: Case) -> None:
