@@ -86,19 +86,19 @@ class Case(Subject, Probe):
         )
 
     @cached_property
-    def drawn(self) -> tuple[Lanes, dict[str, Array]]:
+    def drawn(self) -> tuple[Lanes, Lanes]:
         """The first samples of all views, and the ``wi``, ``uv`` and ``u`` that they were drawn with."""
         few = slice(0, self.count(2**12, 2**13))
-        names = {name: np.repeat(rows, few.stop, axis=0) for name, rows in self.incidence.items()}
-        names["u"] = np.concatenate([view.u[few] for view in self.views])
-        return joined([view.samples.only(few) for view in self.views]), names
+        at = self.incidence.only(np.repeat(np.arange(len(self.views)), few.stop))
+        at.u = np.concatenate([view.u[few] for view in self.views])
+        return joined([view.samples.only(few) for view in self.views]), at
 
     @cached_property
-    def incidence(self) -> dict[str, Array]:
+    def incidence(self) -> Lanes:
         """The directions of incidence ``wi`` and texture coordinates ``uv`` of all views."""
         wi = np.array([view.wi for view in self.views])
         uv = np.array([view.uv for view in self.views])
-        return {"wi": wi, "uv": uv}
+        return Lanes(wi=wi, uv=uv)
 
     @cached_property
     def densities(self) -> list[Cells | None]:

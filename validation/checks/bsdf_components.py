@@ -9,7 +9,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
 from mrt_mitsuba.validation.checks.law import Law, Skip, at_most, figures, most, number_of
-from mrt_mitsuba.validation.checks.probe import Array, Probe, context, excess
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, context, excess
 
 FLAGS = "print([hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())], hex(int(bsdf.flags())))\n"
 UPDATED = """params = mi.traverse(bsdf)
@@ -67,7 +67,7 @@ def components(law: Law, case: Case) -> None:
         mi.traverse(copy).update({key: type(value)(value) for key, value in old.items()})
         law.hold("updated", abs(copy.component_count() - len(flags)), keys=list(old))
     parts = [case.eval(p.wi, p.wo, p.uv, context(i)) for i in range(len(flags))]
-    law.hold("sum", excess(np.sum(parts, axis=0), p.value, p.value_off), **vars(p))
+    law.hold("sum", excess(np.sum(parts, axis=0), p.value, p.value_off), p)
     dark = 0
     for i, (flag, value) in enumerate(zip(flags, parts, strict=True)):
         dark += _component(law, case, i, flag, value)
@@ -81,7 +81,7 @@ def _component(law: Law, case: Case, i: int, flag: int, value: Array) -> int:
     lit = (value != 0).any(axis=1)
     with_width = flag & ~int(mi.BSDFFlags.Delta)
     bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(with_width, p.wi, p.wo)
-    law.hold("values", bad, component=i, **vars(p))
+    law.hold("values", bad, p, component=i)
     # samples of one component that go by another name, kind or side
     count = case.count(2**12, 2**14)
     wi = case.units(count)
@@ -120,19 +120,19 @@ def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
     every = int(mi.BSDFFlags.All)
     kinds = [flag & every for flag in flags]
     p = case.pairs
-    names = {"wi": p.wi, "uv": p.uv, "wo": p.wo}
-    few = slice(0, case.count(2**12, 2**13))
+    at = Lanes(wi=p.wi, uv=p.uv, wo=p.wo)
+    few = at.only(slice(0, case.count(2**12, 2**13)))
     for mask in sorted({*kinds, *(every & ~kind for kind in kinds)} - {0}):
         ctx = context(type_mask=mask)
         chosen = [part for kind, part in zip(kinds, parts, strict=True) if kind & ~mask == 0]
         expected = np.sum([np.zeros_like(p.value), *chosen], axis=0)
         value, pdf = case.both(p.wi, p.wo, p.uv, ctx)
-        law.hold("masked", excess(value, expected, p.value_off), mask=mask, **names)
-        s = case.sample(p.wi[few], case.uniform(len(p.wi[few]), 3), p.uv[few], ctx)
+        law.hold("masked", excess(value, expected, p.value_off), at, mask=mask)
+        s = case.sample(few.wi, case.uniform(len(few.wi), 3), few.uv, ctx)
         bad = s.lit & np.isfinite(s.weight).all(axis=1) & ((s.type & ~mask) != 0)
         if not chosen:
-            bad |= (pdf > 0)[few]
-        law.hold("masked_samples", bad, mask=mask, **{name: rows[few] for name, rows in names.items()})
+            bad |= pdf[: len(bad)] > 0
+        law.hold("masked_samples", bad, few, mask=mask)
 
 
 @figures(
@@ -165,7 +165,7 @@ def variants(law: Law, case: Case) -> None:
             expected = expected.mean(axis=1)
             allowed = allowed.max(axis=1)
         error = np.maximum(excess(value, expected, allowed), excess(pdf, few.pdf, few.pdf_off))
-        law.hold("same", error, variants=(here, other), other=other, here=here, **vars(few))
+        law.hold("same", error, few, variants=(here, other), other=other, here=here)
 
 
 @figures(
@@ -189,4 +189,4 @@ def switch(law: Law, case: Case) -> None:
     for which, bsdf in candidates.items():
         value, pdf = Probe(bsdf).both(few.wi, few.wo, few.uv)
         error = np.maximum(excess(value, few.value, few.value_off), excess(pdf, few.pdf, few.pdf_off))
-        law.hold("same", error, which=which, other=other, variants=(here, other, here), **vars(few))
+        law.hold("same", error, few, which=which, other=other, variants=(here, other, here))

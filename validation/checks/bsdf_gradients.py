@@ -12,7 +12,7 @@ import numpy as np
 from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.bsdf_case import Case, affine, changed, live, narrow, parameters
 from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, at_most, figures, most, number_of
-from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
+from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Lanes, Probe, as_mitsuba, context, excess
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
 IN_THE_MEAN = 5e-2  # where outlines of lobes move, derivatives of samples miss them
@@ -129,8 +129,8 @@ def _attached(law: Law, case: Case, key: str) -> bool:
     measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(derivative)[usual].sum(), 1e-30)
     i = int(np.where(usual, off, 0).argmax())
     how = "" if attached else " (detached)"
-    law.hold("values", measured, wi=few.wi[i], uv=few.uv[i], wo=few.wo[i], key=key, how=how)
-    law.hold("broken", broken, wi=few.wi, uv=few.uv, wo=few.wo, key=key)
+    law.hold("values", measured, few.only(i), key=key, how=how)
+    law.hold("broken", broken, few, key=key)
     return attached or measured <= GRADIENT
 
 
@@ -212,8 +212,8 @@ def _reached(law: Law, case: Case, key: str) -> None:
     except RuntimeError:  # what is loaded goes by another name, or takes other numbers
         return
     value = other.eval(few.wi, few.wo, few.uv)
-    names = {**vars(few), "value": value, "key": key, "number": number}
-    law.hold("reached", excess(value, few.value, few.value_off), **names)
+    off = excess(value, few.value, few.value_off)
+    law.hold("reached", off, Lanes(**{**vars(few), "value": value}), key=key, number=number)
 
 
 def _moved(old: mi.Float, shift: mi.Float) -> mi.Float:

@@ -9,7 +9,7 @@ from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, live, narrow
 from mrt_mitsuba.validation.checks.bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
 from mrt_mitsuba.validation.checks.law import SIGMAS, Law, at_most, figures, most, rare, share_of
-from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar
+from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
 from mrt_mitsuba.validation.checks.sphere import (
     Cells,
     chi_square,
@@ -67,8 +67,7 @@ def sampling(law: Law, case: Case) -> None:
     if not judged:
         law.notes.append(f"{UNRESOLVED} at every angle")
         return
-    wi = np.array([view.wi for view, _ in judged])
-    uv = np.array([view.uv for view, _ in judged])
+    at = case.incidence.only([cells is not None for cells in case.densities])
     tests = []  # [angles, 6, 2]
     worst = []
     beyond = []
@@ -82,8 +81,8 @@ def sampling(law: Law, case: Case) -> None:
     chances = stats.chi2.sf(by_angle[..., 0], by_angle[..., 1])
     chance = sidak(float(chances.min()), chances.size)
     i = int(chances[:-1].min(axis=1).argmin())
-    law.hold("cells", chance, wi=wi[i], uv=uv[i], cell=worst[i], angles=len(judged))
-    law.hold("integral", np.maximum(beyond, 0), wi=wi, uv=uv)
+    law.hold("cells", chance, at.only(i), cell=worst[i], angles=len(judged))
+    law.hold("integral", np.maximum(beyond, 0), at)
     broad = [view for view in case.views if 0 < view.density.max() < BROAD]
     if broad and not case.quick and not is_scalar():
         _in_small_cells(law, case, broad)
@@ -93,18 +92,17 @@ def sampling(law: Law, case: Case) -> None:
 
 def _nudged(law: Law, case: Case) -> None:
     """Of three random numbers, two at least lead to another direction when they move a little."""
-    drawn, names = case.drawn
-    u = names["u"]
+    drawn, at = case.drawn
+    u = at.u
     changes = np.zeros(len(u), int)
     for number in range(3):
         moved = u.copy()
         moved[:, number] += np.where(u[:, number] < 0.5, NUDGE, -NUDGE)
-        wo = case.sample(names["wi"], moved, names["uv"]).wo
+        wo = case.sample(at.wi, moved, at.uv).wo
         changes += (wo != drawn.wo).any(axis=1)
     smooth = drawn.lit & ~drawn.delta & (drawn.pdf < BROAD) & np.isfinite(drawn.wo).all(axis=1)
     if smooth.sum() >= 20:
-        still = (changes < 2)[smooth]
-        law.hold("still", still, **{name: rows[smooth] for name, rows in names.items()})
+        law.hold("still", (changes < 2)[smooth], at.only(smooth))
 
 
 def _without_density(law: Law, case: Case) -> None:
@@ -154,9 +152,9 @@ def weights(law: Law, case: Case) -> None:
 
     Of lobes of one direction, the density is the probability with which they are drawn.
     """
-    drawn, names = case.drawn
-    at = names["wi"], np.where(np.isfinite(drawn.wo), drawn.wo, 1), names["uv"]
-    counts = live(names["wi"], drawn, *case.both(*at)) | drawn.lit & ~drawn.delta
+    drawn, at = case.drawn
+    pairs = at.wi, np.where(np.isfinite(drawn.wo), drawn.wo, 1), at.uv
+    counts = live(at.wi, drawn, *case.both(*pairs)) | drawn.lit & ~drawn.delta
     few = slice(0, len(drawn.pdf) // len(case.views))
     counts &= ~np.concatenate([narrow(view.wi, view.samples.only(few)) for view in case.views])
 
@@ -165,8 +163,8 @@ def weights(law: Law, case: Case) -> None:
         return value / np.where(pdf > 0, pdf, np.inf)[:, None]
 
     for name, stated, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
-        error = excess(stated, function(*at), case.spread(function, *at))
-        law.hold(name, np.where(counts, error, 0), **names)
+        error = excess(stated, function(*pairs), case.spread(function, *pairs))
+        law.hold(name, np.where(counts, error, 0), at)
     errors = []
     angles = []
     for i, view in enumerate(case.views):
@@ -174,7 +172,7 @@ def weights(law: Law, case: Case) -> None:
         errors += beyond
         angles += [i] * len(beyond)
     if errors:
-        law.hold("discrete", np.array(errors), **{name: x[angles] for name, x in case.incidence.items()})
+        law.hold("discrete", errors, case.incidence.only(angles))
 
 
 def _discrete(s: Lanes) -> list[float]:
@@ -225,10 +223,9 @@ def energy(law: Law, case: Case) -> None:
         # where values are NaN, the law ``finite`` says so
         apart.append(_apart(case, view, cells, s) if cells and view.holes < 0.01 else 0)
     surely = [(mean - SIGMAS * error).max() for mean, error in means]
-    at = case.incidence
-    law.hold("largest", surely, wi=np.concatenate([wi, at["wi"]]), uv=np.concatenate([uv, at["uv"]]))
+    law.hold("largest", surely, joined([Lanes(wi=wi, uv=uv), case.incidence]))
     if any(case.densities):
-        law.hold("apart", apart, **at)
+        law.hold("apart", apart, case.incidence)
 
 
 def _mean(weight: Array) -> tuple[Array, Array]:

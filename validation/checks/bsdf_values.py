@@ -36,8 +36,8 @@ def eval_pdf(law: Law, case: Case) -> None:
     case.need_smooth()
     p = case.pairs
     value, pdf = case.pair(p.wi, p.wo, p.uv)
-    law.hold("value", excess(value, p.value, p.value_off), **vars(p))
-    law.hold("density", excess(pdf, p.pdf, p.pdf_off), **vars(p))
+    law.hold("value", excess(value, p.value, p.value_off), p)
+    law.hold("density", excess(pdf, p.pdf, p.pdf_off), p)
 
     def switched_off(ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> list[mi.Spectrum]:
         no_lane = wo.z > 2
@@ -46,7 +46,7 @@ def eval_pdf(law: Law, case: Case) -> None:
 
     if not is_scalar():  # where Mitsuba takes ``active`` out of its plugins
         values = case.ask(switched_off, p.wi, p.wo, p.uv)
-        law.hold("inactive", np.any(values, axis=(0, 2)), **vars(p))
+        law.hold("inactive", np.any(values, axis=(0, 2)), p)
 
 
 RECIPROCITY = """eta = {eta}  # index of refraction at wo over that at wi
@@ -96,7 +96,7 @@ def reciprocity(law: Law, case: Case) -> None:
     E. Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, § 5.2.
     """
     few = case.pairs.only(np.abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
-    at = few.wi, few.wo, few.uv, few.eta
+    pairs = few.wi, few.wo, few.uv, few.eta
 
     def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
         return case.eval(i, o, t) / np.abs(o[:, 2:]) * eta[:, None] ** 2
@@ -107,18 +107,18 @@ def reciprocity(law: Law, case: Case) -> None:
     def importance(i: Array, o: Array, t: Array, _: Array) -> Array:
         return case.eval(i, o, t, context(importance=True)) / np.abs(o[:, 2:])
 
-    value = forth(*at)
-    allowed = case.spread(forth, *at)
+    value = forth(*pairs)
+    allowed = case.spread(forth, *pairs)
     for name, other in (("swapped", back), ("modes", importance)):
-        error = excess(value, other(*at), allowed + case.spread(other, *at))
-        law.hold(name, error, **vars(few))
+        error = excess(value, other(*pairs), allowed + case.spread(other, *pairs))
+        law.hold(name, error, few)
     _delta_either_way(law, case)
     # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
-    s, names = case.drawn
+    s, at = case.drawn
     reflected = ((s.type & int(mi.BSDFFlags.Reflection)) != 0) & s.lit
     if reflected.any():
         off = np.nan_to_num(np.abs(s.eta - 1), nan=np.inf)
-        law.hold("medium", np.where(reflected, off, 0), **names)
+        law.hold("medium", np.where(reflected, off, 0), at)
 
 
 def _delta_either_way(law: Law, case: Case) -> None:
@@ -136,9 +136,9 @@ def _delta_either_way(law: Law, case: Case) -> None:
     returned = (np.abs(probe.unit(back.wo) - wi) < 1e-3).all(axis=1)
     if same.sum() < 20:
         return
-    names = {"wi": wi, "uv": uv, "u": u, "back": v}
+    at = Lanes(wi=wi, uv=uv, u=u, back=v)
     lost = int((same & ~returned).argmax())
-    law.hold("returns", returned[same].mean(), **{name: rows[lost] for name, rows in names.items()})
+    law.hold("returns", returned[same].mean(), at.only(lost))
 
     def followed(i: Array, _: Array, t: Array, u: Array) -> Array:
         s = case.sample(i, u, t)
@@ -149,11 +149,11 @@ def _delta_either_way(law: Law, case: Case) -> None:
     # next to total reflection, a rounding of the direction is a percent of what is transmitted
     allowed = case.spread(followed, *there) + case.spread(followed, *and_back)
     error = excess(followed(*there), followed(*and_back), allowed)
-    law.hold("single", np.where(same & returned, error, 0), **names)
+    law.hold("single", np.where(same & returned, error, 0), at)
     other = case.sample(wi, u, uv, context(importance=True))  # by the same random numbers
     alike = forth.delta & (np.abs(other.wo - forth.wo) < 1e-3).all(axis=1)
     error = excess(forth.weight * forth.eta[:, None] ** 2, other.weight)
-    law.hold("single_modes", np.where(alike, error, 0), **names)
+    law.hold("single_modes", np.where(alike, error, 0), at)
 
 
 # A dot product of float32 vectors is rarely less than 1e-7
@@ -235,8 +235,8 @@ def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None =
     if words or not setting:
         where = f" with {setting[0]} = {setting[1]:g}" if setting else ""
         name = "values" if wrong_values else "samples"
-        names = {**vars(at), "setting": setting, "where": where, "faults": words or "none"}
-        law.hold(name, np.any([*kinds.values()], axis=0), **names)
+        faults = np.any([*kinds.values()], axis=0)
+        law.hold(name, faults, at, setting=setting, where=where, faults=words or "none")
     return not words
 
 
@@ -305,7 +305,7 @@ def roundoff(law: Law, case: Case) -> None:
         estimate = noise.measure(at, inputs, seed=case.seed, project=_both_unit)
         if np.isnan(estimate.noise).mean() > 0.25:
             raise Skip("values change too fast for float32 steps to tell noise")
-        law.hold("lost", estimate.lost, function=name, stride=estimate.stride, **vars(few))
+        law.hold("lost", estimate.lost, few, function=name, stride=estimate.stride)
 
 
 def _both_unit(x: Array) -> Array:

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.scene.loading import load_dict
-from mrt_mitsuba.validation.checks.probe import Array, is_scalar, unit
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, is_scalar, unit
 from mrt_mitsuba.validation.tools.study import Bound, Study, notebook, save_report
 
 TITLE = "Laws of plugins"
@@ -40,6 +40,7 @@ Found = TypeVar("Found")
 Description = dict[str, Any]  # of a plugin, as ``mi.load_dict`` takes it
 Given = Any  # such a dict, or a loaded plugin
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
+NOWHERE = Lanes()
 TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
 
 
@@ -109,14 +110,16 @@ class Law:
     figures: Mapping[str, Figure] = field(default_factory=dict)
     program: Callable[..., str] | None = None  # writes snippets, while the law is checked
 
-    def hold(self, name: str, measured: ArrayLike, *, limit: Any = None, **names: Any) -> None:
+    def hold(
+        self, name: str, measured: ArrayLike, at: Lanes = NOWHERE, *, limit: float | None = None, **names: Any
+    ) -> None:
         """Hold a figure, a number or N errors, to its limit.
 
-        ``names`` fill its words and its snippet: values, or arrays that have a row for each error.
+        ``at`` and ``names`` fill its words and its snippet: values, or arrays that have a row for each error.
         """
         figure = self.figures[name]
-        limit = figure.limit if limit is None else limit
         errors = np.asarray(measured, np.float64)
+        names = vars(at) | names
         if figure.statistic in ("at most", "at least"):
             amount = float(errors)
         else:
@@ -125,17 +128,16 @@ class Law:
         snippet = ""
         if self.program and figure.snippet:
             snippet = self.program(figure.snippet, **names)
-        self.parts.append(
-            Part(
-                name=figure.what.format(**names),
-                measured=float(amount),
-                limit=float(limit),
-                at_most=figure.statistic != "at least",
-                note=figure.why,
-                figure=name,
-                snippet=snippet,
-            )
+        part = Part(
+            name=figure.what.format(**names),
+            measured=float(amount),
+            limit=float(figure.limit if limit is None else limit),
+            at_most=figure.statistic != "at least",
+            note=figure.why,
+            figure=name,
+            snippet=snippet,
         )
+        self.parts.append(part)
 
     @property
     def worst(self) -> Part:

@@ -198,7 +198,7 @@ def as_mitsuba(kind: str, column: Array) -> Any:
 
 def unit(v: Array) -> Array:
     """Vectors [N, 3] made one unit long, in float32."""
-    return (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
+    return np.float32(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def direction(cos: Array | float, phi: Array | float) -> Array:

@@ -41,9 +41,10 @@ print("from just behind:", back.n, "at", back.t)
 def trace(target: mi.Scene, o: Array, d: Array) -> Lanes:
     """Trace rays from float32 points [N, 3] in directions [N, 3].
 
-    The hits have whether a ray met anything (``met``), the distance ``t``, the points and vectors ``p``,
-    ``n``, ``shading``, ``du``, ``dv`` [N, 3], ``uv`` [N, 2], the index of the triangle or the like
-    (``part``), and whether the surface is ``steep``: met, and not in passing.
+    The hits have the rays themselves (``o``, ``d``), whether a ray met anything (``met``), the distance
+    ``t``, the points and vectors ``p``, ``n``, ``shading``, ``du``, ``dv`` [N, 3], ``uv`` [N, 2], the index
+    of the triangle or the like (``part``), the cosine with the normal (``cos``), and whether the surface is
+    ``steep``: met, and not in passing.
     """
 
     def call(origin: mi.Point3f, direction: mi.Vector3f) -> list[Any]:
@@ -52,7 +53,7 @@ def trace(target: mi.Scene, o: Array, d: Array) -> Lanes:
 
     names = ("met", "t", "p", "n", "shading", "du", "dv", "uv", "part")
     columns = lanes(call, ("Point3f", o), ("Vector3f", d))
-    hits = Lanes(**dict(zip(names, columns, strict=True)))
+    hits = Lanes(o=o, d=d, **dict(zip(names, columns, strict=True)))
     hits.cos = dot(hits.n, d)
     hits.steep = hits.met & (np.abs(hits.cos) > FLAT)
     return hits
@@ -63,18 +64,16 @@ def dot(a: Array, b: Array) -> Array:
     return (a * b).sum(axis=-1)
 
 
-def walk(target: mi.Scene, o: Array, d: Array, first: Lanes | None = None) -> Iterator[tuple[Array, Lanes]]:
-    """Follow N lines through all that they meet; yield hit by hit which lines do, and what they meet."""
-    line = np.arange(len(o))
-    hits = first or trace(target, o, d)
+def walk(target: mi.Scene, hits: Lanes) -> Iterator[tuple[Array, Lanes]]:
+    """Follow N lines on from their first hits; yield hit by hit which lines meet something, and what."""
+    line = np.arange(len(hits.t))
     for _ in range(MOST_HITS):
         line = line[hits.met]
-        d = d[hits.met]
         hits = hits.only(hits.met)
         if not len(line):
             return
         yield line, hits
-        hits = trace(target, leave(hits.p, hits.n, d), d)
+        hits = trace(target, leave(hits, hits.d), hits.d)
 
 
 class Case(Subject):
@@ -97,9 +96,7 @@ class Case(Subject):
             self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
             self.plugin.set_id(name)  # which the scene has changed
             self.unsupported = self.unsupported or _refused(self.plugin)
-        box = self.plugin.bbox()
-        corners = [np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max)]
-        self.box = np.array(corners)
+        self.box = corners(self.plugin)
         if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
             raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
         self.points = self.box  # and of a mesh the vertices and the middles of edges
@@ -116,34 +113,29 @@ class Case(Subject):
 
     def around(self, count: int) -> Array:
         """Points that look at the shape, from 1.5 sizes away. [count, 3]"""
-        return (self.middle + 1.5 * self.size * self.units(count)).astype(np.float32)
+        return np.float32(self.middle + 1.5 * self.size * self.units(count))
 
     @cached_property
-    def seen(self) -> tuple[Array, Array, Lanes]:
+    def seen(self) -> Lanes:
         """Rays from all around to points in the box, and what they meet."""
         o = self.around(self.count(2**14, 2**17))
         extent = np.maximum(self.high - self.low, 0.01 * self.size)
         d = unit(self.middle + extent * self.rng.uniform(-0.55, 0.55, o.shape) - o)
-        return o, d, trace(self.target, o, d)
-
-    def first_seen(self, few: slice) -> tuple[Array, Array, Lanes]:
-        """The first of ``seen``."""
-        o, d, hits = self.seen
-        return o[few], d[few], hits.only(few)
+        return trace(self.target, o, d)
 
     @cached_property
-    def met(self) -> tuple[Array, Array, Lanes]:
+    def met(self) -> Lanes:
         """The rays that meet the surface and do not graze it, and their hits."""
-        o, d, hits = self.seen
-        if hits.steep.sum() < 20:
+        steep = self.seen.steep
+        if steep.sum() < 20:
             raise Skip("hardly any ray towards its bounding box meets the shape")
-        return o[hits.steep], d[hits.steep], hits.only(hits.steep)
+        return self.seen.only(steep)
 
     @cached_property
     def behind(self) -> Lanes:
         """The hits of rays that come back from just behind ``met``."""
-        _, d, hits = self.met
-        return trace(self.target, leave(hits.p, hits.n, d), -d)
+        d = self.met.d
+        return trace(self.target, leave(self.met, d), -d)
 
     @cached_property
     def positions(self) -> tuple[list[Array], Array, float]:
@@ -163,7 +155,7 @@ class Case(Subject):
     @cached_property
     def crossings(self) -> list[tuple[Array, Lanes]]:
         """Whole lines: hit by hit, which line, and what it meets."""
-        return list(walk(self.target, *self.seen))
+        return list(walk(self.target, self.seen))
 
     @cached_property
     def closed(self) -> bool:
@@ -174,7 +166,7 @@ class Case(Subject):
     @cached_property
     def lines(self) -> tuple[Array, Array]:
         """Which lines can be judged, and which cross the surface an even number of times; both [N]."""
-        clear = self.seen[2].met.copy()
+        clear = self.seen.met.copy()
         even = np.ones(len(clear), bool)
         last = np.full((len(clear), 3), np.inf)
         for line, hits in self.crossings:
@@ -205,7 +197,13 @@ def near(p: Array, q: Array) -> Array:
     return np.linalg.norm(p - q, axis=1) < 4 * offset(p)
 
 
-def leave(p: Array, n: Array, d: Array) -> Array:
-    """Origins [N, 3] off the surface on the side of ``d``, as ``spawn_ray`` has them."""
-    outwards = np.sign(dot(n, d))[:, None] * n
-    return (p + outwards * offset(p)[:, None]).astype(np.float32)
+def leave(hits: Lanes, d: Array) -> Array:
+    """Origins [N, 3] off points ``p`` with normals ``n``, on the side of ``d``, as ``spawn_ray`` has them."""
+    outwards = np.sign(dot(hits.n, d))[:, None] * hits.n
+    return np.float32(hits.p + outwards * offset(hits.p)[:, None])
+
+
+def corners(plugin: mi.Shape) -> Array:
+    """The least and the greatest corner of a bounding box. [2, 3]"""
+    box = plugin.bbox()
+    return np.array([np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max)])

@@ -99,18 +99,18 @@ def sampling(law: Law, case: Case) -> None:
     law.hold("area", abs(np.mean(1 / pdf) / area - 1))
     few = slice(0, case.count(2**14, 2**17))
     # sampled positions, and their normals, as rays meet them
-    start = (p + n * 0.01 * case.size).astype(np.float32)[few]
+    start = np.float32(p + n * 0.01 * case.size)[few]
     inwards = -n[few]
     back = trace(case.target, start, unit(inwards))
     # another part of the surface may be nearer than a hundredth of the size
     away = np.where(back.met, np.linalg.norm(back.p - p[few], axis=1), np.inf)
     scale = np.abs(p[few]).max(axis=1) + 0.01 * case.size
-    law.hold("off", away / (ROUNDING * scale), o=start, d=inwards)
+    law.hold("off", away / (ROUNDING * scale), back)
     if back.met.any():
         cosine = np.minimum(dot(-inwards, back.shading), dot(-inwards, back.n))
         cosine = cosine / np.linalg.norm(inwards, axis=1)
         off = np.where(back.met, 1 - cosine, np.nan)
-        law.hold("normal", off, o=start, d=inwards)
+        law.hold("normal", off, back)
     if case.behind.met.mean() > 0.5:
         _area(law, case, p, n, area)
     else:
@@ -125,11 +125,11 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     d = case.units(count)
     across = unit(np.cross(d, case.units(count)))
     disk = radius * np.sqrt(case.rng.random((count, 1))) * across
-    start = (case.middle + disk - 2 * radius * d).astype(np.float32)
-    twice = _coinciding(case, p, unit(n))
+    start = np.float32(case.middle + disk - 2 * radius * d)
+    twice = _coinciding(case, Lanes(p=p, n=unit(n)))
     crossed = np.zeros(count)
     points = []
-    for line, hits in walk(case.target, start, d):
+    for line, hits in walk(case.target, trace(case.target, start, d)):
         crossed[line] += 1
         points.append(hits.p)
     crossings = np.concatenate(points)
@@ -160,12 +160,12 @@ ROOM = 2e-3  # lines that graze are left room for
 VIEWS = 3  # from which directions are compared
 
 
-def _coinciding(case: Case, p: Array, n: Array) -> float:
-    """Share of points [N, 3] where two parts of the surface coincide, and a line meets only one of them."""
-    one = trace(case.target, leave(p, n, n), -n)
-    other = trace(case.target, leave(p, n, -n), n)
+def _coinciding(case: Case, at: Lanes) -> float:
+    """Share of points where two parts of the surface coincide, and a line meets only one of them."""
+    one = trace(case.target, leave(at, at.n), -at.n)
+    other = trace(case.target, leave(at, -at.n), at.n)
     both = one.met & other.met & (one.part != other.part)
-    return float((both & near(p, one.p) & near(p, other.p)).mean())
+    return float((both & near(at.p, one.p) & near(at.p, other.p)).mean())
 
 
 def _is_edge_on(p: Array, axis: Array) -> bool:
@@ -210,17 +210,15 @@ def _directions(law: Law, case: Case, u: Array) -> None:
         law.notes.append("the shape has no sample_direction()")
         return
     drawn = pdf > 0
-    met = trace(case.target, o, d.astype(np.float32))
-    law.hold("direction", np.where(drawn, np.abs(pdf / again - 1), 0), o=o, d=d)
+    met = trace(case.target, o, np.float32(d))
+    law.hold("direction", np.where(drawn, np.abs(pdf / again - 1), 0), met)
     before_it = met.steep & (met.t > dist * (1 + 1e-3))
-    law.hold("misses", drawn & np.where(met.met, before_it, True), o=o, d=d)
-    weight = _visible(d, dist, pdf, met)
-    mean, variance = _moments(case, o, d, met.p, weight)
+    law.hold("misses", drawn & np.where(met.met, before_it, True), met)
+    mean, variance = _moments(case, met, _visible(dist, pdf, met))
     # the same by uniform directions into the cone that holds the shape
     o = case.around(case.count(2**17, 2**19))
-    away = _into_cone(case, o, case.rng)
-    met = trace(case.target, o, away)
-    expected, other = _moments(case, o, away, met.p, np.where(met.met, CONE, 0))
+    met = trace(case.target, o, _into_cone(case, o, case.rng))
+    expected, other = _moments(case, met, np.where(met.met, CONE, 0))
     off = np.abs(mean - expected) - SIGMAS * np.sqrt(variance + other)
     law.hold("angle", max(off.max(), 0) / expected[0])
     if len(u) >= 2**12:
@@ -239,7 +237,7 @@ def _sampled(case: Case, o: Array, u: Array) -> list[Array]:
     return lanes(sample, ("Point3f", o), ("Point2f", u))
 
 
-def _visible(d: Array, dist: Array, pdf: Array, met: Lanes) -> Array:
+def _visible(dist: Array, pdf: Array, met: Lanes) -> Array:
     """The solid angle that each sampled direction stands for, 0 where its point is hidden. [N]"""
     visible = (pdf > 0) & met.met & (met.t > dist * (1 - 1e-3))
     return np.where(visible, 1 / np.where(pdf > 0, pdf, 1), 0)
@@ -263,10 +261,10 @@ def _aim(case: Case, count: int) -> float:
     apart = []
     size = np.inf
     for _ in range(VIEWS):
-        place = (case.middle + 1.5 * case.size * unit(rng.normal(size=3))).astype(np.float32)
+        place = np.float32(case.middle + 1.5 * case.size * unit(rng.normal(size=3)))
         o = np.tile(place, (count, 1))
         d, dist, pdf, _ = _sampled(case, o, rng.random((count, 2), np.float32))
-        weight = _visible(d, dist, pdf, trace(case.target, o, d.astype(np.float32)))
+        weight = _visible(dist, pdf, trace(case.target, o, np.float32(d)))
         away = _into_cone(case, o, rng)
         seen = away[trace(case.target, o, away).met]
         fewest = count // 16
@@ -281,10 +279,10 @@ def _aim(case: Case, count: int) -> float:
     return _chance(apart, size) if apart else 1.0
 
 
-def _moments(case: Case, o: Array, d: Array, p: Array, weight: Array) -> tuple[Array, Array]:
+def _moments(case: Case, met: Lanes, weight: Array) -> tuple[Array, Array]:
     """Means [8] of weights, alone and times place, its squares and the angle, and their variances [8]."""
-    place = (p - case.middle) / case.size
-    cosine = dot(d, unit(case.middle - o))[:, None]
+    place = (met.p - case.middle) / case.size
+    cosine = dot(met.d, unit(case.middle - met.o))[:, None]
     angle = (1 - cosine) * 2 * np.pi / CONE
     factors = np.concatenate([np.ones_like(angle), place, 4 * place**2, angle], axis=1)
     products = np.where(weight[:, None] > 0, weight[:, None] * factors, 0)
