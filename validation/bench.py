@@ -60,7 +60,7 @@ def rows(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
 
 
 def start(turns: int) -> Row:
-    """Return the seconds of the command against those of a bare start, as after installation."""
+    """The seconds of the command against those of a bare start, as after installation."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600, "env": environment}
 
@@ -91,7 +91,7 @@ def cases(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
 
 
 def read(path: Path) -> dict[str, Row]:
-    """Return the rows of an earlier run. Raises ``UsageError`` for a file that is none."""
+    """The rows of an earlier run. Raises ``UsageError`` for a file that is none."""
     try:
         return dict(json.loads(path.read_text())["rows"])
     except (OSError, ValueError, TypeError, KeyError) as error:

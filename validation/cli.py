@@ -106,7 +106,7 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
 
 
 def listing() -> str:
-    """Return a line on each study, with how long it takes on two idle cores."""
+    """A line on each study, with how long it takes on two idle cores."""
     quick, full = (sum(seconds) for seconds in list(zip(*STUDIES.values(), strict=True))[2:])
     rows = [(name, *entry[1:]) for name, entry in STUDIES.items()] + [("all", "all of these", quick, full)]
     lines = [f"  {n:<15}{_spoken(quick):>7}{_spoken(full):>8}  {about}" for n, about, quick, full in rows]

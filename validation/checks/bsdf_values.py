@@ -264,7 +264,7 @@ def _by_the_million(law: Law, case: Case) -> None:
         read = probe.not_finite(bs.pdf, value, pdf, least=0)
         bad = probe.not_finite(weight, least=0) | (lit & read)
     wrong, first = probe.first_of(bad, wi=wi, uv=uv, u=u)
-    law.hold("million", wrong, count=count, **first)
+    law.hold("million", wrong, first, count=count)
 
 
 NOISE = """for k in range(9):  # float32 steps in all components: a smooth function would change evenly

@@ -142,12 +142,13 @@ def not_finite(*values: mi.Float | mi.Spectrum, least: float = -np.inf) -> mi.Ma
     return bad
 
 
-def first_of(bad: mi.Mask, **columns: mi.Point3f) -> tuple[int, dict[str, Array]]:
+def first_of(bad: mi.Mask, **columns: mi.Point3f) -> tuple[int, Lanes]:
     """In how many lanes something is bad, and a row of each column in the first of these."""
     dr.eval(bad, *columns.values())
     wrong = dr.compress(bad)
     index = wrong[0] if dr.width(wrong) else 0
-    return dr.width(wrong), {name: np.array(x)[:, index].astype(np.float32) for name, x in columns.items()}
+    first = {name: np.float32(np.array(x)[:, index]) for name, x in columns.items()}
+    return dr.width(wrong), Lanes(**first)
 
 
 def lanes(call: Callable[..., Sequence[Any]], *columns: tuple[str, Array]) -> list[Array]:

@@ -489,7 +489,7 @@ def _by_the_million(law: Law, case: Case) -> None:
         ps = case.plugin.sample_position(0, mi.Point2f(draw(), draw()))
         bad |= not_finite(ps.p, ps.n, ps.pdf)
     wrong, first = first_of(bad, o=o, d=d)
-    law.hold("million", wrong, count=count, **first)
+    law.hold("million", wrong, first, count=count)
 
 
 @figures(

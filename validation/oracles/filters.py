@@ -14,10 +14,11 @@ import math
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, sobel
 
-Edges = tuple[np.ndarray, np.ndarray, np.ndarray]
+Array = np.ndarray
+Edges = tuple[Array, Array, Array]
 
 
-def luma_edges(image: np.ndarray) -> Edges:
+def luma_edges(image: Array) -> Edges:
     """The contrast of ``√(0.299 R + 0.587 G + 0.114 B)`` in the 3×3 neighbourhood."""
     red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
     luma = np.sqrt(0.299 * red + 0.587 * green + 0.114 * blue)
@@ -27,7 +28,7 @@ def luma_edges(image: np.ndarray) -> Edges:
     return _inside(~(contrast < threshold), contrast, np.abs(contrast - threshold))
 
 
-def sobel_edges(image: np.ndarray) -> Edges:
+def sobel_edges(image: Array) -> Edges:
     """The Sobel gradient of ``int(255 (0.07 R + 0.72 G + 0.21 B))``.
 
     The margin is the distance of the nearest grey of the window, before truncation, from a whole number. Next
@@ -40,13 +41,13 @@ def sobel_edges(image: np.ndarray) -> Edges:
     return _inside(gradient > 0, gradient, minimum_filter(from_whole, 3))
 
 
-def blur_amount(depth: np.ndarray, focal_distance: float, focal_range: float) -> np.ndarray:
+def blur_amount(depth: Array, focal_distance: float, focal_range: float) -> Array:
     """The height map: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``, and 8 for a miss."""
     amount = np.clip(np.abs(focal_distance - depth.astype(np.float64)) - focal_range, 0, 8)
     return np.where((depth <= 0) | np.isinf(depth), 8, amount)
 
 
-def gaussian_dof(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
+def gaussian_dof(image: Array, amount: Array) -> Array:
     """Blur with Pascal windows; ``amount`` as from ``blur_amount``, both with the top row first."""
     buffer = np.asarray(image, dtype=np.float64)[::-1]  # row 0 at the bottom
     amount = amount[::-1]
@@ -62,13 +63,13 @@ def gaussian_dof(image: np.ndarray, amount: np.ndarray) -> np.ndarray:
     return result[::-1]
 
 
-def disc_radius(amount: np.ndarray) -> np.ndarray:
+def disc_radius(amount: Array) -> Array:
     """The radii of the discs of the corrected blur."""
     small = amount**2 / (8 - 4 * np.minimum(amount, 1) ** 2)
     return np.where(amount < 1, small, np.sqrt(np.maximum(2 * amount - 23 / 16, 0)) - 0.5)
 
 
-def corrected_dof(image: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def corrected_dof(image: Array, radius: Array) -> Array:
     """Blur with discs of signed radii, negative before the focus; see ``mrt_mitsuba.filters.dof``.
 
     A neighbour is in front, in the same layer and behind by parts that add up to one. What is in front, or
@@ -79,10 +80,10 @@ def corrected_dof(image: np.ndarray, radius: np.ndarray) -> np.ndarray:
     padded = np.pad(np.dstack([image, np.ones(radius.shape), radius]), ((5, 5), (5, 5), (0, 0)), mode="edge")
     front, same, behind = np.zeros((3, *radius.shape, 4))
 
-    def disc(radius: np.ndarray, dx: int, dy: int) -> np.ndarray:
+    def disc(radius: Array, dx: int, dy: int) -> Array:
         """The share of its light that a disc has in a pixel so far away."""
         cover = [np.clip(radius + 1 - math.hypot(*step), 0, 1) for step in ((dx, dy), *steps)]
-        return np.asarray(cover[0] / sum(cover[1:]))[..., None]
+        return (cover[0] / sum(cover[1:]))[..., None]
 
     for dx, dy in steps:
         there = padded[5 + dy : 5 + dy + len(radius), 5 + dx : 5 + dx + radius.shape[1]]
@@ -104,7 +105,7 @@ def corrected_dof(image: np.ndarray, radius: np.ndarray) -> np.ndarray:
     return hidden * colors[0] + (1 - hidden) * (solid * colors[1] + gap * colors[2]) / (solid + gap)
 
 
-def _inside(mask: np.ndarray, value: np.ndarray, margin: np.ndarray) -> Edges:
+def _inside(mask: Array, value: Array, margin: Array) -> Edges:
     """A detector's result; the border, whose windows are not whole, is surely no edge."""
     inner = np.zeros(mask.shape, bool)
     inner[1:-1, 1:-1] = True

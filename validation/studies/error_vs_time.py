@@ -150,22 +150,22 @@ def choices(number: Number, cost: Cost = DOCS, progress: Progress | None = None)
 
 
 def advice(panels: Mapping[str, Findings]) -> list[dict[str, Any]]:
-    """Return rows that say what to use to get to an error, for each title of ``choices``."""
+    """Rows that say what to use to get to an error, for each title of ``choices``."""
     return [{"": title, **row} for title, found in panels.items() for row in found.advice()]
 
 
 def title_of(number: Number) -> str:
-    """Return a scene's name."""
+    """A scene's name."""
     return f"Scene {number}" if isinstance(number, int) else number
 
 
 def rmse(found: Findings, case: str) -> float:
-    """Return the error of a case."""
+    """The error of a case."""
     return found.points[case].rmse
 
 
 def judged(case: str) -> Limit:
-    """Return the limit of the reference's error, by the case of least error."""
+    """The limit of the reference's error, by the case of least error."""
     return Limit(
         "error of the reference / least error it judges",
         lambda found: found.reference_error / rmse(found, case),
@@ -175,7 +175,7 @@ def judged(case: str) -> Limit:
 
 
 def _scene(number: Number, size: tuple[int, int], **options: Any) -> Options:
-    """Return a scene of the report, or Mitsuba's Cornell box, as a dict."""
+    """A scene of the report, or Mitsuba's Cornell box, as a dict."""
     width, height = size
     if isinstance(number, int):
         return mrt.scene_dict(number, width=width, height=height, **options)
@@ -189,7 +189,7 @@ def _with_sampler(nodes: Options, sampler: str) -> Options:
 
 
 def _rounds(cost: Cost, **options: Any) -> dict[str, Options]:
-    """Return renders whose rays go to noise, so many of them or to an error."""
+    """Renders whose rays go to noise, so many of them or to an error."""
     own = {"aa": None, "lattice": None, **options}
     most = 2 * max(cost.rounds, default=1)
     cases = {f"aamode=noise spp={spp}": {**own, "aamode": "noise", "spp": spp} for spp in cost.rounds}
@@ -198,7 +198,7 @@ def _rounds(cost: Cost, **options: Any) -> dict[str, Options]:
 
 
 def sampling(number: int, cost: Cost) -> Trade:
-    """Return which pixels get how many samples, and where in the pixel."""
+    """Which pixels get how many samples, and where in the pixel."""
     least = cost.amounts[0]
     greatest = cost.amounts[-1]
     few, many = (f"none aa={aa} centered" for aa in (least, greatest))
@@ -234,7 +234,7 @@ def sampling(number: int, cost: Cost) -> Trade:
 
 
 def whitted(number: int, cost: Cost) -> Trade:
-    """Return cut-off, bounce limit and form of the Fresnel factor, at the same samples."""
+    """Cut-off, bounce limit and form of the Fresnel factor, at the same samples."""
 
     def integrator(**parameters: Any) -> Options:
         return {"integrator": {"type": "mrt_whitted", **parameters}}

@@ -42,7 +42,7 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def rmse(image: np.ndarray, truth: np.ndarray) -> float:
-    """Return the root of the mean squared difference."""
+    """The root of the mean squared difference."""
     return float(np.sqrt(np.mean(np.square(image - truth, dtype=np.float64))))
 
 
@@ -119,7 +119,7 @@ def depth_of_field(study: Study, *, quick: bool) -> None:
 
 
 def fit_lens(scene: Scene, depth: np.ndarray) -> dict[str, float]:
-    """Return the lens whose discs are nearest to the report's blur of these hit distances [H, W]."""
+    """The lens whose discs are nearest to the report's blur of these hit distances [H, W]."""
     amount = filters.blur_amount(depth, focal_distance=scene.focal_distance, focal_range=scene.focal_range)
     radius = disc_radius(np.asarray(amount, np.float64))
     hit = np.isfinite(depth)
@@ -130,7 +130,7 @@ def fit_lens(scene: Scene, depth: np.ndarray) -> dict[str, float]:
 
 
 def disc_radius(amount: np.ndarray) -> np.ndarray:
-    """Return the radius of the disc as wide as the report's blur, pixels.
+    """The radius of the disc as wide as the report's blur, pixels.
 
     The Pascal line of 2k entries has the variance (2k − 1)/4 on each axis, a disc of radius r one of r²/4.
     The whole amount k is continued to all numbers, and by a² below 1, where the report does not blur.

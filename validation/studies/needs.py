@@ -39,7 +39,7 @@ Figures = dict[str, dict[str, float]]  # of ``MEASURES``, by the way
 
 
 def general(plan: KernelPlan) -> KernelPlan:
-    """Return a plan that leaves out no code that a kernel may hold."""
+    """A plan that leaves out no code that a kernel may hold."""
     return replace(
         plan,
         mirrors=True,
@@ -54,7 +54,7 @@ def general(plan: KernelPlan) -> KernelPlan:
 
 
 def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
-    """Return a scene, and the same with kernels that leave nothing out."""
+    """A scene, and the same with kernels that leave nothing out."""
     width, height = size
     nodes = mrt.scene_dict(number, width=width, height=height)
     planned = mi.load_dict(nodes)
@@ -66,7 +66,7 @@ def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
 
 
 def measure(number: int, size: tuple[int, int], repeats: int) -> tuple[Figures, Result]:
-    """Return the figures of each way to render a scene, with edges refined, and a result as planned."""
+    """The figures of each way to render a scene, with edges refined, and a result as planned."""
     planned, whole = scenes_of(number, size)
     general_way = REFINED | {"layers": "all"}
     renders: dict[str, Callable[..., Result]] = {

@@ -20,19 +20,18 @@ from mrt_mitsuba.validation.checks.emitter import check_emitter
 from mrt_mitsuba.validation.checks.law import Check, Description
 from mrt_mitsuba.validation.checks.shape import check_shape
 
-Answer = Any  # of a plugin: numbers, or a record of some
-Change = Callable[..., Answer]
+Change = Callable[..., Any]  # makes a wrong answer of a plugin's: numbers, or a record of some
 Changes = tuple[Description, str, Any]  # the BSDF that is changed, the kind of change, and the change
 
 
-def unchanged(value: Answer, *_: Answer) -> Answer:
+def unchanged(value, *_):
     return value
 
 
 AS_IS: Changes = ({}, "", unchanged)
 
 
-def changed_bsdf(changes: Mapping[str, Changes]) -> type:
+def changed_bsdf(changes):
     """A class of BSDFs whose answers are those of another, changed: for ``register_bsdf``.
 
     ``changes``: by name, the dict of the BSDF, what is changed, and a function: of (value, ctx, wi, wo) for
@@ -42,7 +41,7 @@ def changed_bsdf(changes: Mapping[str, Changes]) -> type:
     """
 
     class Changed(mi.BSDF):
-        def __init__(self, props: mi.Properties) -> None:
+        def __init__(self, props):
             mi.BSDF.__init__(self, props)
             self.nested = props["nested"]
             _, self.kind, self.change = changes.get(props["change"], AS_IS)[:3]
@@ -53,55 +52,30 @@ def changed_bsdf(changes: Mapping[str, Changes]) -> type:
             if self.kind in ("flags", "whole"):
                 self.m_flags |= self.change
 
-        def traverse(self, callback: mi.TraversalCallback) -> None:
+        def traverse(self, callback):
             callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
 
-        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        def parameters_changed(self, keys=()):
             if self.kind == "update":
                 self.m_components = [*self.m_components, self.m_flags]
 
-        def changed(self, kinds: Sequence[str], value: Answer, *where: Answer) -> Answer:
+        def changed(self, kinds, value, *where):
             return self.change(value, *where) if self.kind in kinds else value
 
-        def eval(
-            self,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            wo: mi.Vector3f,
-            active: mi.Mask = True,
-        ) -> mi.Spectrum:
+        def eval(self, ctx, si, wo, active=True):
             asked = self.changed(("context",), ctx)
             value = self.nested.eval(asked, si, wo, True if self.kind == "active" else active)
             return self.changed(("eval", "value"), value, ctx, si.wi, wo)
 
-        def pdf(
-            self,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            wo: mi.Vector3f,
-            active: mi.Mask = True,
-        ) -> mi.Float:
+        def pdf(self, ctx, si, wo, active=True):
             asked = self.changed(("context",), ctx)
             return self.changed(("pdf",), self.nested.pdf(asked, si, wo, active), ctx, si.wi, wo)
 
-        def eval_pdf(
-            self,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            wo: mi.Vector3f,
-            active: mi.Mask = True,
-        ) -> tuple[mi.Spectrum, mi.Float]:
+        def eval_pdf(self, ctx, si, wo, active=True):
             pair = self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
             return self.changed(("pair",), pair, ctx, si.wi, wo)
 
-        def sample(
-            self,
-            ctx: mi.BSDFContext,
-            si: mi.SurfaceInteraction3f,
-            sample1: mi.Float,
-            sample2: mi.Point2f,
-            active: mi.Mask = True,
-        ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+        def sample(self, ctx, si, sample1, sample2, active=True):
             asked = self.changed(("context",), ctx)
             u = self.changed(("u",), sample2)
             bs, weight = self.nested.sample(asked, si, sample1, u, active)
@@ -110,7 +84,7 @@ def changed_bsdf(changes: Mapping[str, Changes]) -> type:
                 return self.change(bs, weight, sample2, ctx)
             return bs, weight
 
-        def to_string(self) -> str:
+        def to_string(self):
             return f"Changed[{self.kind}]"
 
     return Changed
@@ -123,12 +97,12 @@ SAMPLED = ("surface_area", "sample_position", "pdf_position", "sample_direction"
 class ChangedShape:
     """A shape some of whose methods are changed: functions of what they return and of their arguments."""
 
-    def __init__(self, given: Description | None = None, **changes: Change) -> None:
+    def __init__(self, given=None, **changes):
         self.shape = mi.load_dict(given or {"type": "cube"})
         self.scene = mi.load_dict({"type": "scene", "shape": self.shape})
         self.changes = changes
 
-    def __getattr__(self, name: str) -> Change:
+    def __getattr__(self, name):
         if name not in TRACED + SAMPLED:
             raise AttributeError(name)
         sound = getattr(self.scene if name in TRACED else self.shape, name)
@@ -136,7 +110,7 @@ class ChangedShape:
         return lambda *given: change(sound(*given), *given)
 
 
-def changed_sky(changes: Mapping[str, Change]) -> type:
+def changed_sky(changes):
     """A class of emitters, constant all around but for changes of what its methods return.
 
     ``changes``: functions of the samples of directions and their random numbers ("direction"), of their
@@ -144,45 +118,39 @@ def changed_sky(changes: Mapping[str, Change]) -> type:
     and eval() ("seen") return.
     """
 
-    def changed(kind: str, value: Answer, *more: Answer) -> Answer:
+    def changed(kind, value, *more):
         return changes[kind](value, *more) if kind in changes else value
 
     class Sky(mi.Emitter):
-        def __init__(self, props: mi.Properties) -> None:
+        def __init__(self, props):
             mi.Emitter.__init__(self, props)
             self.m_flags = mi.EmitterFlags.Infinite
             self.sound = mi.load_dict({"type": "constant"})
 
-        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Mask = True) -> mi.Spectrum:
+        def eval(self, si, active=True):
             return changed("seen", self.sound.eval(si, active))
 
-        def sample_direction(
-            self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Mask = True
-        ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        def sample_direction(self, it, sample, active=True):
             ds, weight = self.sound.sample_direction(it, sample, active)
             ds.emitter = mi.EmitterPtr(self)
             return changed("direction", ds, sample), changed("weight", weight, sample)
 
-        def pdf_direction(
-            self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Mask = True
-        ) -> mi.Float:
+        def pdf_direction(self, it, ds, active=True):
             return changed("pdf", self.sound.pdf_direction(it, ds, active), ds)
 
-        def eval_direction(
-            self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Mask = True
-        ) -> mi.Spectrum:
+        def eval_direction(self, it, ds, active=True):
             return changed("value", self.sound.eval_direction(it, ds, active))
 
-        def bbox(self) -> mi.BoundingBox3f:
+        def bbox(self):
             return mi.ScalarBoundingBox3f()
 
-        def to_string(self) -> str:
+        def to_string(self):
             return "Sky"
 
     return Sky
 
 
-def put(record: Answer, **members: Answer) -> Answer:
+def put(record, **members):
     """A hit or a sample with other values of some members."""
     for name, value in members.items():
         setattr(record, name, value)
@@ -256,58 +224,58 @@ PLACE = (0.48, 0.36, 0.8)  # a direction away from all axes
 # ------------------------------------ Changes, of a size and a value -----------------------------------
 
 
-def larger(size: float, value: Answer, *_: Answer) -> Answer:
+def larger(size, value, *_):
     return (1 + size) * value
 
 
-def smaller(size: float, value: Answer, *_: Answer) -> Answer:
+def smaller(size, value, *_):
     return value / (1 + size)
 
 
-def member(name: str, change: Change) -> Change:
+def member(name, change):
     """A change of a member of a record; what comes with the record stays."""
 
-    def apply(size: float, record: Answer, *given: Answer) -> Answer:
+    def apply(size, record, *given):
         return put(record, **{name: change(size, getattr(record, name))})
 
     return apply
 
 
-def of_sample(change: Change) -> Change:
+def of_sample(change):
     """A change of records as one of the samples of a BSDF, whose weight stays."""
 
-    def apply(size: float, bs: mi.BSDFSample3f, weight: mi.Spectrum, *_: Answer) -> Answer:
+    def apply(size, bs, weight, *_):
         return change(size, bs), weight
 
     return apply
 
 
-def of_weight(change: Change) -> Change:
+def of_weight(change):
     """A change of the weights of samples of a BSDF, by their random numbers."""
 
-    def apply(size: float, bs: mi.BSDFSample3f, weight: mi.Spectrum, u: mi.Point2f, _: Answer) -> Answer:
+    def apply(size, bs, weight, u, _):
         return bs, change(size, weight, u)
 
     return apply
 
 
-def in_tenth(size: float, pdf: mi.Float, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
+def in_tenth(size, pdf, ctx, wi, wo):
     """Larger where a tenth of the samples of a diffuse BSDF go."""
     return pdf * dr.select(wo.x > 0.687, 1 + size, 1)
 
 
-def in_cone(size: float, pdf: mi.Float, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
+def in_cone(size, pdf, ctx, wi, wo):
     inside = dr.norm(wo - mi.Vector3f(PLACE)) < DEGREE
     return pdf * dr.select(inside, 1 - min(size, 0.9), 1)
 
 
-def no_density(size: float, pdf: mi.Float, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f) -> mi.Float:
+def no_density(size, pdf, ctx, wi, wo):
     """0 in a slice of azimuth, so many degrees wide."""
     azimuth = dr.atan2(wo.y, wo.x)
     return dr.select((azimuth > 1) & (azimuth < 1 + size * DEGREE), 0, pdf)
 
 
-def around_slice(size: float, bs: mi.BSDFSample3f) -> mi.BSDFSample3f:
+def around_slice(size, bs):
     """Samples of a diffuse BSDF that keep out of a slice of azimuth, so many degrees wide."""
     azimuth = dr.atan2(bs.wo.y, bs.wo.x)
     slice_ = size * DEGREE
@@ -317,68 +285,64 @@ def around_slice(size: float, bs: mi.BSDFSample3f) -> mi.BSDFSample3f:
     return put(bs, wo=wo)
 
 
-def stairs_of(size: float, u: mi.Point2f) -> mi.Point2f:
+def stairs_of(size, u):
     """Random numbers in steps."""
     return mi.Point2f(dr.floor(u.x / size) * size, u.y)
 
 
-def no_number(size: float, weight: mi.Spectrum, u: mi.Point2f) -> mi.Spectrum:
+def no_number(size, weight, u):
     """NaN for a share of the random numbers."""
     return dr.select((u.x > 0.3) & (u.x < 0.3 + size), dr.nan, weight)
 
 
-def no_number_at_the_end(size: float, weight: mi.Spectrum, u: mi.Point2f) -> mi.Spectrum:
+def no_number_at_the_end(size, weight, u):
     return dr.select(u.x > 1 - size, dr.nan, weight)
 
 
-def weight_in_stairs(size: float, weight: mi.Spectrum, u: mi.Point2f) -> mi.Spectrum:
+def weight_in_stairs(size, weight, u):
     odd = dr.floor(16 * u.x) - 2 * dr.floor(8 * u.x)
     return weight * (1 + size * odd)
 
 
-def first_channel(size: float, pair: tuple[mi.Spectrum, mi.Float], *_: Answer) -> Answer:
+def first_channel(size, pair, *_):
     value, pdf = pair
     return value * mi.Color3f(1 + size, 1, 1), pdf
 
 
-def density_of_pair(size: float, pair: tuple[mi.Spectrum, mi.Float], *_: Answer) -> Answer:
+def density_of_pair(size, pair, *_):
     value, pdf = pair
     return value, (1 + size) * pdf
 
 
-def too_bright(size: float, value: mi.Spectrum, *_: Answer) -> mi.Spectrum:
+def too_bright(size, value, *_):
     """A diffuse BSDF of albedo 0.5 that reflects more than arrives."""
     return 2 * (1 + size) * value
 
 
-def with_cosine(
-    size: float, value: mi.Spectrum, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f
-) -> Answer:
+def with_cosine(size, value, ctx, wi, wo):
     return value * (1 + size * wi.z)
 
 
-def from_one_side(
-    size: float, value: mi.Spectrum, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f
-) -> Answer:
+def from_one_side(size, value, ctx, wi, wo):
     return value * (1 + size * (wi.z > 0))
 
 
-def by_mode(size: float, value: mi.Spectrum, ctx: mi.BSDFContext, *_: Answer) -> mi.Spectrum:
+def by_mode(size, value, ctx, *_):
     """Larger in the mode of importance."""
     return value * (1 + size * (ctx.mode == mi.TransportMode.Importance))
 
 
-def by_component(size: float, value: mi.Spectrum, ctx: mi.BSDFContext, *_: Answer) -> mi.Spectrum:
+def by_component(size, value, ctx, *_):
     return value * (1 + size * (ctx.component == 0))
 
 
-def by_mask(size: float, value: mi.Spectrum, ctx: mi.BSDFContext, *_: Answer) -> mi.Spectrum:
+def by_mask(size, value, ctx, *_):
     """Larger where lobes are asked for by their types."""
     every = mi.BSDFContext().type_mask
     return value * (1 + size * (ctx.type_mask != every))
 
 
-def without_mask(size: float, ctx: mi.BSDFContext) -> mi.BSDFContext:
+def without_mask(size, ctx):
     """The types of lobes are ignored, whatever the size."""
     other = mi.BSDFContext()
     other.mode = ctx.mode
@@ -386,107 +350,101 @@ def without_mask(size: float, ctx: mi.BSDFContext) -> mi.BSDFContext:
     return other
 
 
-def by_variant(size: float, value: mi.Spectrum, *_: Answer) -> mi.Spectrum:
+def by_variant(size, value, *_):
     """Larger in scalar variants."""
     return value if dr.is_jit_v(value) else (1 + size) * value
 
 
-def negative_next_to_normal(
-    size: float, value: mi.Spectrum, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f
-) -> mi.Spectrum:
+def negative_next_to_normal(size, value, ctx, wi, wo):
     return dr.select(dr.minimum(wi.z, wo.z) > 1 - size, -1, 1) * value
 
 
-def stairs_on_slope(
-    size: float, value: mi.Spectrum, ctx: mi.BSDFContext, wi: mi.Vector3f, wo: mi.Vector3f
-) -> mi.Spectrum:
+def stairs_on_slope(size, value, ctx, wi, wo):
     slope = wi.z * wo.z / size
     return value * (1 + size * (dr.round(slope) - slope))
 
 
-def steeper(size: float, value: mi.Spectrum, *_: Answer) -> mi.Spectrum:
+def steeper(size, value, *_):
     """The same number, with a larger derivative."""
     return value + size * (value - dr.detach(value))
 
 
-def tilted(size: float, n: mi.Normal3f) -> mi.Normal3f:
+def tilted(size, n):
     """Normals tilted by an angle."""
     return dr.normalize(n + size * mi.Normal3f(0.6, 0.48, 0.64))
 
 
-def tilted_frame(size: float, frame: mi.Frame3f) -> mi.Frame3f:
+def tilted_frame(size, frame):
     return mi.Frame3f(tilted(size, frame.n))
 
 
-def off_surface(size: float, record: mi.Interaction3f, *_: Answer) -> mi.Interaction3f:
+def off_surface(size, record, *_):
     return put(record, p=record.p + SIZE * size * record.n)
 
 
-def too_far(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+def too_far(size, si, ray):
     return put(si, t=si.t + SIZE * size, p=si.p + SIZE * size * ray.d)
 
 
-def off_from_afar(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+def off_from_afar(size, si, ray):
     return put(si, p=dr.select(si.t > 1000, si.p + size * si.t * si.n, si.p))
 
 
-def in_share(size: float, ray: mi.Ray3f) -> mi.Mask:
+def in_share(size, ray):
     """Rays of a share of the directions."""
     return ray.d.x > 1 - 2 * size
 
 
-def missed_in_share(size: float, met: mi.Mask, ray: mi.Ray3f) -> mi.Mask:
+def missed_in_share(size, met, ray):
     return met & ~in_share(size, ray)
 
 
-def missed(where: Change) -> Change:
+def missed(where):
     """A change of hits that are missed in some places."""
 
-    def apply(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+    def apply(size, si, ray):
         return put(si, t=dr.select(where(size, si, ray), dr.inf, si.t))
 
     return apply
 
 
-def close(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Mask:
+def close(size, si, ray):
     return (si.t < 0.01) & in_share(size, ray)
 
 
-def afar(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Mask:
+def afar(size, si, ray):
     return (si.t > 1000) & in_share(size, ray)
 
 
-def slit(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Mask:
+def slit(size, si, ray):
     return dr.abs(si.p.x - 0.3) < SIZE * size / 2
 
 
-def slit_above(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Mask:
+def slit_above(size, si, ray):
     return slit(size, si, ray) & (si.n.z > 0.5)
 
 
-def inwards(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+def inwards(size, si, ray):
     turned = (si.p.x > 1 - 2 * size) & (si.n.x < 0.5)
     return put(si, n=dr.select(turned, -1, 1) * si.n)
 
 
-def no_number_along_axis(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+def no_number_along_axis(size, si, ray):
     return put(si, uv=dr.select(dr.abs(ray.d.x) < size, dr.nan, si.uv))
 
 
-def no_number_in_place(size: float, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.SurfaceInteraction3f:
+def no_number_in_place(size, si, ray):
     """NaN for about a share of the rays, in one direction."""
     inside = (ray.d.x > 0.3) & (ray.d.x < 0.3 + 2 * size)
     return put(si, uv=dr.select(inside, dr.nan, si.uv))
 
 
-def crowded(size: float, ps: mi.PositionSample3f, time: mi.Float, u: mi.Point2f) -> mi.PositionSample3f:
+def crowded(size, ps, time, u):
     """Positions on a square, crowded to one side."""
     return put(ps, p=mi.Point3f(2 * u.x ** (1 + size) - 1, ps.p.y, 0))
 
 
-def crowded_azimuth(
-    size: float, ps: mi.PositionSample3f, time: mi.Float, u: mi.Point2f
-) -> mi.PositionSample3f:
+def crowded_azimuth(size, ps, time, u):
     """Positions on a unit sphere, crowded to one azimuth."""
     azimuth = 2 * dr.pi * u.y ** (1 + size)
     radius = dr.hypot(ps.p.x, ps.p.y)
@@ -494,9 +452,7 @@ def crowded_azimuth(
     return put(ps, p=p, n=mi.Normal3f(p))
 
 
-def crowded_directions(
-    size: float, ds: mi.DirectionSample3f, it: mi.Interaction3f, u: mi.Point2f
-) -> mi.DirectionSample3f:
+def crowded_directions(size, ds, it, u):
     """Directions turned around the one to the middle, to crowd at one azimuth."""
     frame = mi.Frame3f(dr.normalize(-mi.Vector3f(it.p)))
     local = frame.to_local(ds.d)
@@ -507,36 +463,34 @@ def crowded_directions(
     return put(ds, d=d, p=it.p + ds.dist * d)
 
 
-def too_short(
-    size: float, ds: mi.DirectionSample3f, it: mi.Interaction3f, u: mi.Point2f
-) -> mi.DirectionSample3f:
+def too_short(size, ds, it, u):
     return put(ds, dist=ds.dist * dr.select(u.x < size, 0.99, 1))
 
 
-def lower_top(size: float, box: mi.BoundingBox3f) -> mi.BoundingBox3f:
+def lower_top(size, box):
     return mi.BoundingBox3f(box.min, (1 - 2 * size) * box.max)
 
 
-def higher_bottom(size: float, box: mi.BoundingBox3f) -> mi.BoundingBox3f:
+def higher_bottom(size, box):
     return mi.BoundingBox3f((1 - 2 * size) * box.min, box.max)
 
 
-def in_hole(size: float, d: mi.Vector3f) -> mi.Mask:
+def in_hole(size, d):
     """Directions in a cone, so many degrees across."""
     return dr.norm(d - mi.Vector3f(PLACE)) < size * DEGREE / 2
 
 
-def around_hole(size: float, ds: mi.DirectionSample3f, u: mi.Point2f) -> mi.DirectionSample3f:
+def around_hole(size, ds, u):
     """Directions that are never in a cone: they go the other way."""
     d = dr.select(in_hole(size, ds.d), -ds.d, ds.d)
     return put(ds, p=ds.p + ds.dist * (d - ds.d), d=d)
 
 
-def no_density_in_hole(size: float, pdf: mi.Float, ds: mi.DirectionSample3f) -> mi.Float:
+def no_density_in_hole(size, pdf, ds):
     return dr.select(in_hole(size, ds.d), 0, pdf)
 
 
-def no_density_of_sample(size: float, ds: mi.DirectionSample3f, u: mi.Point2f) -> mi.DirectionSample3f:
+def no_density_of_sample(size, ds, u):
     ds = around_hole(size, ds, u)
     return put(ds, pdf=no_density_in_hole(size, ds.pdf, ds))
 
@@ -544,34 +498,17 @@ def no_density_of_sample(size: float, ds: mi.DirectionSample3f, u: mi.Point2f) -
 # ------------------------------------------------ Faults ----------------------------------------------
 
 
-def bsdf_fault(
-    figure: str,
-    what: str,
-    full: float,
-    kind: str,
-    change: Change,
-    *,
-    quick: float | None = None,
-    nested: Description | None = None,
-) -> Fault:
+def bsdf_fault(figure, what, full, kind, change, *, quick=None, nested=None):
     """A fault of a BSDF, which changes one kind of answer."""
     return Fault(figure, what, full, {kind: change}, quick, nested)
 
 
-def shape_fault(
-    figure: str,
-    what: str,
-    full: float,
-    *,
-    quick: float | None = None,
-    nested: Description | None = None,
-    **changes: Change,
-) -> Fault:
+def shape_fault(figure, what, full, *, quick=None, nested=None, **changes):
     """A fault of a shape, which changes some of its methods."""
     return Fault(figure, what, full, changes, quick, nested, "shape")
 
 
-def sky_fault(figure: str, what: str, full: float, *, quick: float | None = None, **changes: Change) -> Fault:
+def sky_fault(figure, what, full, *, quick=None, **changes):
     """A fault of a constant sky."""
     return Fault(figure, what, full, changes, quick, None, "emitter")
 

@@ -56,7 +56,7 @@ def theirs(alpha: float, *, visible: bool = True) -> dict[str, Any]:
 
 
 def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> dict[str, float]:
-    """Return the largest relative differences over ``count`` random pairs of directions, by ``NAMES``.
+    """The largest relative differences over ``count`` random pairs of directions, by ``NAMES``.
 
     Of plain D sampling's density only where |ωi + ωo|² > ``SHORT``: Mitsuba's divides by ωo·h and so feels
     the rounding of the length of ωo, by 6e-8 / |ωi + ωo|².
@@ -111,7 +111,7 @@ class RoughconductorComparison:
 
     @property
     def equal(self) -> bool:
-        """Return whether neither single points nor the pictures distinguish them."""
+        """Whether neither single points nor the pictures distinguish them."""
         return self.errors[P_VALUE] >= LEVEL and all(self.errors[name] <= POINTWISE for name in NAMES)
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -32,7 +32,7 @@ SHINY = Material(1.5, 0.1, (0.9, 0.8, 0.7), (0.1, 0.1, 0.1))
 
 
 def _crowded(lights: int) -> Scene:
-    """Return a few hundred objects of all kinds, looked up in trees and in light buffers."""
+    """A few hundred objects of all kinds, looked up in trees and in light buffers."""
     rng = np.random.default_rng(5)
     start = rng.uniform(-2, 2, (330, 3))
     ends = start + 0.5 * rng.normal(size=(330, 3))
@@ -101,7 +101,7 @@ def judge(
 
 
 def draw(scene: Any, size: Any, *, fresnel: str = "dielectric", **integrator: Any) -> np.ndarray:
-    """Return our picture, one sample per pixel, with no path cut short."""
+    """Our picture, one sample per pixel, with no path cut short."""
     settings = {"type": "mrt_whitted", "min_contribution": 0.0, **integrator}
     options: dict[str, Any] = {"width": size[0], "height": size[1], "aa": 1, "aamode": "none", "focaldist": 0}
     return mrt.render(scene, **options, fresnel=fresnel, integrator=settings).image

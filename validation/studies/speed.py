@@ -116,7 +116,7 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
         return abs(two / one / factor - 1)
 
     def direct(number: int, flavor: str) -> tuple[Run, Run]:
-        """Return direct light in the scene of a flavour, with Mitsuba's lights in place of ours."""
+        """Direct light in the scene of a flavour, with Mitsuba's lights in place of ours."""
         stock, own = (nodes(number, flavor=name) for name in ("stock", flavor))
         lights = {name: node for name, node in stock.items() if name.startswith("light_")}
         del own["sky"]  # direct would sample it, mrt_whitted does not
@@ -125,7 +125,7 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
         return _by_mitsuba(own | lights, ours, extent.spp), _by_mitsuba(own | lights, theirs, extent.spp)
 
     def materials(number: int) -> tuple[Run, Run]:
-        """Return the scene of Mitsuba's plugins, with either material in place of ``roughplastic``."""
+        """The scene of Mitsuba's plugins, with either material in place of ``roughplastic``."""
         stock = nodes(number, flavor="stock")
         keep = "specular_reflectance"
         plastics = {n: m for n, m in stock.items() if isinstance(m, dict) and m["type"] == "roughplastic"}
@@ -169,7 +169,7 @@ def other_ways(extent: Extent) -> Iterator[Pair]:
 
 
 def left_out(nodes: Nodes, change: Nodes, more: dict[str, Any]) -> tuple[Run, Run]:
-    """Return a scene, and the same with what its plan leaves out."""
+    """A scene, and the same with what its plan leaves out."""
     return _render(nodes), _render(nodes | change, **more)
 
 

@@ -77,7 +77,7 @@ def gloss(study: Study, *, quick: bool) -> None:
     waves = np.stack([1 + 0.8 * np.sin(3 * x + phase) * np.sin(y) for phase in (0, 2, 4)], axis=-1)  # smooth
 
     def spheres(alpha: float) -> Nodes:
-        """Return four black, shiny spheres in a smooth environment."""
+        """Four black, shiny spheres in a smooth environment."""
         black: Nodes = {"alpha": alpha, "ior": 3.0, "diffuse": (0, 0, 0), "specular": (1, 1, 1)}
         scene = with_materials(report_scene(0), lambda m: replace(m, **black))
         nodes = replace(scene, planes=(), lights=()).to_dict(width=width, height=height, fresnel="dielectric")
@@ -97,7 +97,7 @@ def gloss(study: Study, *, quick: bool) -> None:
 
 
 def physical(m: Material) -> Material:
-    """Return a material that Mitsuba's plugins take: colours up to 1, positive roughness, no diffuse part.
+    """A material that Mitsuba's plugins take: colours up to 1, positive roughness, no diffuse part.
 
     Then ``mrt_bsdf`` and ``roughplastic``, which refracts diffuse light, are the same. Lobes narrower than
     0.1 make fireflies: no mean of some hundred samples of them is normal, as the tests need it.
@@ -107,12 +107,12 @@ def physical(m: Material) -> Material:
 
 
 def changed(nodes: Nodes, key: str, change: Callable[[Any], Any]) -> Nodes:
-    """Return the nodes with a parameter changed wherever one has it."""
+    """The nodes with a parameter changed wherever one has it."""
     return {n: node | {key: change(node[key])} if key in node else node for n, node in nodes.items()}
 
 
 def too_bright(nodes: Nodes) -> Nodes:
-    """Return the nodes with colours two percent too bright."""
+    """The nodes with colours two percent too bright."""
 
     def brighter(color: Nodes) -> Nodes:
         return color | {"value": [1.02 * x for x in color["value"]]}

@@ -14,18 +14,18 @@ from mrt_mitsuba.validation.checks.probe import Array, Probe, direction, unit
 
 
 def rgb(value: float | Sequence[float]) -> dict[str, Any]:
-    """Return a colour, or a grey, as a Mitsuba dict."""
+    """A colour, or a grey, as a Mitsuba dict."""
     return {"type": "rgb", "value": value if isinstance(value, float | int) else list(value)}
 
 
 def at_angle(degrees: float) -> Array:
-    """Return a direction at an angle to the normal, away from every axis and plane of symmetry."""
+    """A direction at an angle to the normal, away from every axis and plane of symmetry."""
     theta = np.radians(degrees)
     return np.array([np.sin(theta) * 0.8, np.sin(theta) * 0.6, np.cos(theta)])
 
 
 def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array]:
-    """Return pairs of random directions above the surface whose half vector lies within a slope of 4 alpha.
+    """Pairs of random directions above the surface whose half vector lies within a slope of 4 alpha.
 
     Both cosines are at least 0.02. Beyond that slope the lobe is below e^-16 of its peak.
     """
@@ -45,7 +45,7 @@ def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array
 
 
 def evaluate(bsdf: Any, wi: Array, wo: Array) -> list[Array]:
-    """Return f cos θo [N, channels] and density [N] of pairs of directions [N, 3]."""
+    """Values f cos θo [N, channels] and density [N] of pairs of directions [N, 3]."""
     return Probe(bsdf).pair(wi, wo, np.zeros(2))
 
 

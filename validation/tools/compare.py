@@ -20,6 +20,7 @@ from mrt_mitsuba.output.files import read_channels, write_exr, write_png
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.api import Result
 
+Array = np.ndarray
 ORDER = "RGBXYZUVA"  # of channels within a layer; others follow
 ROUNDING = 1e-5  # relative size of differences that are float32's: sums in another order, fused operations
 EPSILON = 0.01  # keeps black pixels, which no relative error describes, from ruling it
@@ -47,8 +48,8 @@ class Difference:
     largest: float  #: largest absolute error of a channel
     place: tuple[int, int]  #: row and column of the largest error
     p_value: float | None  #: of as much difference by noise alone; None where no noise is known
-    difference: np.ndarray  #: a − b, float32 [H, W, C]
-    pictures: tuple[np.ndarray, np.ndarray] = field(repr=False)
+    difference: Array  #: a − b, float32 [H, W, C]
+    pictures: tuple[Array, Array] = field(repr=False)
     inputs: tuple[str, ...] = ()  #: paths of the files that were compared
 
     @cached_property
@@ -66,7 +67,7 @@ class Difference:
         return float(flip_evaluator.evaluate(b, a, "HDR", applyMagma=False, parameters={})[1])
 
     def measures(self) -> dict[str, float | None]:
-        """Return all measures by name."""
+        """All measures by name."""
         return {name: getattr(self, name) for name in MEASURES}
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -140,11 +141,11 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
 
 # A picture or layer [H, W, C] in float64; the variance of its mean [H, W, 1], if it is known; and of an EXR
 # the first column and row, and the last ones
-Layer = tuple[np.ndarray, np.ndarray | None, tuple[int, ...]]
+Layer = tuple[Array, Array | None, tuple[int, ...]]
 
 
 def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer:
-    """Return the picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
+    """The picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
         try:
@@ -168,8 +169,8 @@ def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer
     return found
 
 
-def _layer_of(channels: Mapping[str, np.ndarray], headers: Mapping[str, Any], layer: str, name: str) -> Layer:
-    """Return a layer of channels by name, with what is known of its variance and window."""
+def _layer_of(channels: Mapping[str, Array], headers: Mapping[str, Any], layer: str, name: str) -> Layer:
+    """A layer of channels by name, with what is known of its variance and window."""
     groups: dict[str, list[str]] = {}  # channels by layer, in order
     for key in sorted(channels, key=lambda key: ((ORDER + key[-1]).index(key[-1]), key)):
         groups.setdefault(key.rpartition(".")[0] or key, []).append(key)
@@ -184,7 +185,7 @@ def _layer_of(channels: Mapping[str, np.ndarray], headers: Mapping[str, Any], la
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:
-    """Return the probability of so much difference by noise, of the mean of channels.
+    """The probability of so much difference by noise, of the mean of channels.
 
     Uniform for equal pictures of equal noise. Means over cells are tested by the signs of differences alone,
     which is exact. How the largest difference over its deviation continues the tail of the others depends on
@@ -203,8 +204,8 @@ def _p_value(sides: Sequence[Layer]) -> float | None:
     return float(-np.expm1(np.log1p(-min(0.99 * least, 1 - 1e-15)) + np.log1p(-0.01 * least)))
 
 
-def _p_of_means(difference: np.ndarray) -> float:
-    """Return the probability of the means of differences [H, W] between equal pictures, over cells and all.
+def _p_of_means(difference: Array) -> float:
+    """The probability of the means of differences [H, W] between equal pictures, over cells and all.
 
     Their noise is as often positive as negative, whatever its law. So the least p value of Student's test is
     compared with those after random changes of sign of blocks of pixels; where it is among the least of
@@ -276,12 +277,12 @@ def p_values(ours: ArrayLike, theirs: ArrayLike, *, tile: int = 16) -> dict[str,
 
 
 def sidak(p: float, count: int) -> float:
-    """Return the probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
+    """The probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
     return 1.0 if p >= 1 else float(-np.expm1(count * np.log1p(-p)))
 
 
-def cell_sums(values: np.ndarray, size: int) -> np.ndarray:
-    """Return the sums [..., rows, columns, C] over cells of ``size`` × ``size`` pixels."""
+def cell_sums(values: Array, size: int) -> Array:
+    """The sums [..., rows, columns, C] over cells of ``size`` × ``size`` pixels."""
     for axis in (-3, -2):
         values = np.add.reduceat(values, np.arange(0, values.shape[axis], size), axis=axis)
     return values

@@ -49,7 +49,7 @@ def read_original(path: str | os.PathLike[str]) -> Original:
 
 
 def shortened(picture: np.ndarray, window: tuple[int, int, int, int], block: int, bits: int) -> np.ndarray:
-    """Return a window of a picture, the means of its blocks, with so many significant bits."""
+    """A window of a picture, the means of its blocks, with so many significant bits."""
     x, y, width, height = window
     part = picture[y : y + height, x : x + width].astype(np.float64)
     part = part.reshape(height // block, block, width // block, block, -1).mean(axis=(1, 3))

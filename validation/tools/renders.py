@@ -33,13 +33,13 @@ Render = Callable[..., Any]
 
 
 def load(nodes: Nodes) -> Any:
-    """Return a Mitsuba scene of a dict with our plugins."""
+    """A Mitsuba scene of a dict with our plugins."""
     mrt.register()
     return mi.load_dict(nodes)
 
 
 def with_lights(number: int, **size: Any) -> Nodes:
-    """Return scene 4 with its light from points above, each of its own brightness."""
+    """Scene 4 with its light from points above, each of its own brightness."""
     nodes = mrt.scene_dict(4, **size)
     places = np.outer(np.arange(number), (0.754877666, 0.569840296, 0.362378)) % 1  # evenly in the room
     for i, (a, b, c) in enumerate(places.tolist()):  # also in the places of its own three
@@ -49,7 +49,7 @@ def with_lights(number: int, **size: Any) -> Nodes:
 
 
 def with_triangles(number: int, **size: Any) -> Nodes:
-    """Return hills under the camera and the lights of scene 0."""
+    """Hills under the camera and the lights of scene 0."""
     cells = max(1, round((number / 2) ** 0.5))
     z, x = np.mgrid[-3 : 3 : (cells + 1) * 1j, -3 : 3 : (cells + 1) * 1j]
     positions = np.stack([x, 0.2 * np.sin(5 * x) * np.cos(7 * z), z], axis=-1).reshape(1, -1, 3)
@@ -93,12 +93,12 @@ def crowd(number: int, kind: str, **size: Any) -> Nodes:
 
 
 def of_scene(nodes: Callable[..., Nodes], size: tuple[int, int], options: Nodes) -> Render:
-    """Return a render of a scene that is loaded once."""
+    """A render of a scene that is loaded once."""
     return partial(mrt.render, load(nodes(width=size[0], height=size[1])), **options)
 
 
 def _with_update() -> Render:
-    """Return a render of a loaded scene that changes a colour first."""
+    """A render of a loaded scene that changes a colour first."""
     scene = load(mrt.scene_dict(3, **SMALL))
     parameters = mi.traverse(scene)
     key = next(name for name in list(parameters.keys()) if name.endswith("diffuse_reflectance.value"))
@@ -112,7 +112,7 @@ def _with_update() -> Render:
 
 
 def _prepared() -> Render:
-    """Return a prepared render, or in versions without ``prepare`` a render of a loaded scene."""
+    """A prepared render, or in versions without ``prepare`` a render of a loaded scene."""
     scene = load(mrt.scene_dict(3, **SMALL))
     prepare: Any = getattr(mrt, "prepare", lambda scene, **options: partial(mrt.render, scene, **options))
     render: Render = prepare(scene, **ONE_RAY)
@@ -162,7 +162,7 @@ CASES["small, mi.render"] = (100, _by_mitsuba)
 
 
 def seconds(name: str) -> float:
-    """Return the mean seconds of warm renders of a case."""
+    """The mean seconds of warm renders of a case."""
     number, make = CASES[name]
     render = make()
     for _ in range(1 if number < 10 else 3):

@@ -24,7 +24,7 @@ SPP = 64  # of the samplers of ``SCENES``
 
 
 def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scene:
-    """Return a scene whose spheres and planes have other materials."""
+    """A scene whose spheres and planes have other materials."""
     parts: Node = {
         kind: tuple(dataclasses.replace(t, material=change(t.material)) for t in getattr(scene, kind))
         for kind in ("spheres", "planes")
@@ -35,7 +35,7 @@ def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scen
 def sensor(
     origin: Point, target: Point, rfilter: str = "gaussian", sampler: str = "independent", **more: Any
 ) -> Node:
-    """Return a camera with a film and a sampler."""
+    """A camera with a film and a sampler."""
     film = {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
     return {
         "type": "perspective",
@@ -47,7 +47,7 @@ def sensor(
 
 
 def ball_scene(bsdf: Node, *, size: int = 96) -> mi.Scene:
-    """Return a ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size``."""
+    """A ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size``."""
     film = {"width": size, "height": size * 3 // 4, "pixel_format": "rgb"}
     return mi.load_dict(
         {
@@ -70,7 +70,7 @@ LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
 
 
 def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> Any:
-    """Return a scene by name, at a size; ``film`` and further nodes replace its own."""
+    """A scene by name, at a size; ``film`` and further nodes replace its own."""
     nodes = SCENES[name]()
     size: Node = {"width": width, "height": height}
     if name == "crop":
@@ -138,7 +138,7 @@ def _envmap() -> Node:
 
 
 def _instances() -> Node:
-    """Return nine balls that are one, in three rows."""
+    """Nine balls that are one, in three rows."""
     group: Node = {"type": "ref", "id": "group"}
     nodes = _scene_of(
         sensor([0, 3, 6], [0, 0.5, 0], "box"),

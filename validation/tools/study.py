@@ -49,7 +49,7 @@ class Bound:
 
     @property
     def holds(self) -> bool:
-        """Return whether the figure is within the limit; NaN never is."""
+        """Whether the figure is within the limit; NaN never is."""
         return self.measured <= self.limit if self.at_most else self.measured >= self.limit
 
     @property
@@ -68,7 +68,7 @@ class Bound:
         return f"{self.verdict:<6} {self.name}: {self.measured:.4g} {self.sign} {self.limit:.4g}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the values of ``summary.json``."""
+        """The values of ``summary.json``."""
         figures = {"measured": self.measured, "limit": self.limit, "sense": self.sign}
         return {"name": self.name, **figures, "holds": self.holds, "verdict": self.verdict, "note": self.note}
 
@@ -94,14 +94,14 @@ class Study:
 
     @property
     def verdict(self) -> str:
-        """Return one word: passed, missed (a bound), failed (broke off) or empty (nothing was held)."""
+        """One word: passed, missed (a bound), failed (broke off) or empty (nothing was held)."""
         if self.failure:
             return "failed"
         return "empty" if not self.bounds else "missed" if self.missed else "passed"
 
     @property
     def missed(self) -> set[str]:
-        """Return the names of the bounds that do not hold."""
+        """The names of the bounds that do not hold."""
         return {bound.name for bound in self.bounds if not bound.holds}
 
     def at_most(self, name: str, measured: float, limit: float, note: str) -> None:
@@ -141,7 +141,7 @@ class Study:
                 advance(1)
 
     def summary(self) -> dict[str, Any]:
-        """Return the study as values that JSON can hold; infinite and undefined numbers become text."""
+        """The study in values of JSON; infinite and undefined numbers become text."""
         found = {
             "title": self.title,
             "bounds": [bound.as_dict() for bound in self.bounds],
@@ -157,7 +157,7 @@ class Study:
 
 
 def findings(part: Callable[..., None], **options: Any) -> Study:
-    """Return what a part of a study, or the ``run`` of a whole one, finds."""
+    """The findings of a part of a study, or of the ``run`` of a whole one."""
     study = Study("", "")
     part(study, **options)
     return study
@@ -167,14 +167,14 @@ def findings(part: Callable[..., None], **options: Any) -> Study:
 
 
 def timed(run: Callable[[], Any]) -> tuple[Any, float]:
-    """Return what a function returns, and its seconds."""
+    """The result of a function, and its seconds."""
     start = time.perf_counter()
     result = run()
     return result, time.perf_counter() - start
 
 
 def in_turns(sides: Sequence[Callable[[int], Any]], turns: int) -> list[list[Any]]:
-    """Return what each side gives for the number of each turn, so that a load on the machine meets all.
+    """The results of each side for the number of each turn, so that a load on the machine meets all.
 
     The order changes from turn to turn.
     """
@@ -201,7 +201,7 @@ def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> 
 
 
 def operations(render: Callable[..., Any]) -> list[int]:
-    """Return the length of the code of each kernel of a ``mrt.render``, each counted once."""
+    """The length of the code of each kernel of a ``mrt.render``, each counted once."""
     lengths: dict[Any, int] = {}  # by the hash of the code
 
     class Watch(Progress):
@@ -216,7 +216,7 @@ def operations(render: Callable[..., Any]) -> list[int]:
 
 
 def machine() -> dict[str, Any]:
-    """Return everything that bears on speed or accuracy, without the name of the machine."""
+    """Everything that bears on speed or accuracy, without the name of the machine."""
     versions = dict(runtime.versions())
     return {
         "version": versions.pop("mrt-mitsuba"),
@@ -228,7 +228,7 @@ def machine() -> dict[str, Any]:
 
 
 def terminal_table(studies: Sequence[Study]) -> str:
-    """Return the bounds of all studies, one per line, under the verdict on each study."""
+    """The bounds of all studies, one per line, under the verdict on each study."""
     lines = []
     for study in studies:
         lines += ["", f"{study.name}: {study.title} - {study.verdict.upper()} in {study.seconds:.1f} s"]
@@ -269,13 +269,13 @@ def save_report(
 
 
 def notebook(study: Study, *, title: str) -> str:
-    """Return the page of a study as a frame for a notebook, whose own style it leaves alone."""
+    """The page of a study as a frame for a notebook, whose own style it leaves alone."""
     page = html.escape(_files([study], title)["index.html"].decode())
     return f'<iframe srcdoc="{page}" style="width: 100%; height: 40rem; border: 0"></iframe>'
 
 
 def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[str, bytes]:
-    """Return every file of the report by name. A figure is drawn once, for its file and for the page."""
+    """Every file of the report by name. A figure is drawn once, for its file and for the page."""
     import jinja2
 
     files: dict[str, bytes] = {}
@@ -305,7 +305,7 @@ def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[st
 
 
 def _drawn(content: Any) -> dict[str, Any]:
-    """Return the bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
+    """The bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
     buffer = io.BytesIO()
     if isinstance(content, np.ndarray):
         kind = "picture"
@@ -320,7 +320,7 @@ def _drawn(content: Any) -> dict[str, Any]:
 
 
 def cell(value: Any) -> str:
-    """Return a value as people read it: floats to four digits, a dash for what is not known."""
+    """A value as people read it: floats to four digits, a dash for what is not known."""
     if value is None or value != value:
         return "–"
     if isinstance(value, bool):

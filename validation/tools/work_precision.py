@@ -24,7 +24,7 @@ from mrt_mitsuba.rendering.api import Result, render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.compare import Difference, compare, read_layer
+from mrt_mitsuba.validation.tools.compare import Array, Difference, compare, read_layer
 from mrt_mitsuba.validation.tools.study import Study, notebook, save_report
 
 TITLE = "Error against time"
@@ -56,13 +56,13 @@ class Point:
     cold: float  #: seconds of a first run, its kernels compiled or read from a cache
     compile: float  #: seconds of that in the compiler
     rays: Mapping[str, int]
-    image: np.ndarray  #: of the first repeat
+    image: Array  #: of the first repeat
     difference: Difference  #: of it from the reference
     reference_error: float
 
     @classmethod
-    def of(cls, name: str, times: np.ndarray, gram: np.ndarray, **more: Any) -> Point:
-        """Return the figures of the seconds of repeats and their matrix G; ``more``: the other fields."""
+    def of(cls, name: str, times: Array, gram: Array, **more: Any) -> Point:
+        """The figures from the seconds of repeats and their matrix G; ``more``: the other fields."""
         seconds = float(np.median(times))
         squares = np.diag(gram)
         repeats = len(times)
@@ -97,7 +97,7 @@ class Point:
 
     @property
     def resolved(self) -> bool:
-        """Return whether the error can be distinguished from the reference's own."""
+        """Whether the error can be distinguished from the reference's own."""
         return self.rmse > RESOLVED * self.reference_error
 
 
@@ -108,7 +108,7 @@ class Findings:
     scene: str
     points: Mapping[str, Point]
     failed: Mapping[str, str]  #: why, by case
-    reference: np.ndarray
+    reference: Array
     reference_error: float  #: RMSE of the reference itself, below which nothing is claimed; 0: exact
     repeats: int
     errors: Sequence[float]  #: for which the time is given
@@ -123,7 +123,7 @@ class Findings:
         return groups
 
     def time_to(self, error: float) -> dict[str, tuple[float, ...]]:
-        """Return when each curve comes down to an RMSE, in seconds with an interval; infinite if never.
+        """When each curve comes down to an RMSE, in seconds with an interval; infinite if never.
 
         The interval is from where the lower ends of all intervals come so low to where the upper ends do.
         """
@@ -157,7 +157,7 @@ class Findings:
         return sentences
 
     def advice(self) -> list[dict[str, Any]]:
-        """Return a row for each of ``errors``: the case that gets there first, and the next other curve."""
+        """A row for each of ``errors``: the case that gets there first, and the next other curve."""
         rows = []
         for error in self.errors:
             low = sorted((p for p in self.points.values() if p.rmse <= error), key=lambda p: p.seconds)
@@ -184,7 +184,7 @@ class Findings:
         return "\n".join([*lines, f"the reference's own error: {own}", *self.verdicts])
 
     def study(self) -> Study:
-        """Return what the page shows."""
+        """The findings in the form that pages are made of."""
         scene = f"scene {self.scene}" if self.scene.isdigit() else self.scene
         study = Study("error-vs-time", f"{TITLE}: {scene}", seconds=self.took)
         describe(study, self, "", "All cases")
@@ -198,8 +198,8 @@ class Findings:
         return notebook(self.study(), title=TITLE)
 
 
-def _reach(values: np.ndarray) -> float:
-    """Return how far Student's interval goes to each side of the mean of values; NaN of a single one."""
+def _reach(values: Array) -> float:
+    """How far Student's interval goes to each side of the mean of values; NaN of a single one."""
     from scipy import stats
 
     if len(values) < 2:
@@ -207,8 +207,8 @@ def _reach(values: np.ndarray) -> float:
     return float(stats.t.ppf((1 + LEVEL) / 2, len(values) - 1) * stats.sem(values))
 
 
-def _crossing(seconds: np.ndarray, errors: np.ndarray, error: float) -> float:
-    """Return when a curve of seconds and RMSEs comes down to an error, infinity if it does not.
+def _crossing(seconds: Array, errors: Array, error: float) -> float:
+    """When a curve of seconds and RMSEs comes down to an error, infinity if it does not.
 
     Between its points it is straight in logarithms; beyond them nothing is assumed.
     """
@@ -293,7 +293,7 @@ def error_vs_time(
 
 
 def _runner(scene: Any, shared: Options) -> Run:
-    """Return what renders cases, each scene loaded once where it can be."""
+    """A function that renders cases, each scene loaded once where it can be."""
     variant = runtime.use(shared.get("variant"))
     loaded: dict[int, Any] = {}  # by the id of what a scene is loaded from, which the caller holds
 
@@ -310,8 +310,8 @@ def _runner(scene: Any, shared: Options) -> Run:
     return run
 
 
-def _reference(reference: Any, run: Run) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return two independent halves of the reference, or twice the same picture; and its own error."""
+def _reference(reference: Any, run: Run) -> tuple[Array, Array, float]:
+    """Two independent halves of the reference, or twice the same picture; and its own error."""
     if isinstance(reference, Mapping):
         spp = {"spp": int(reference["spp"]) // 2} if reference.get("spp", 1) > 1 else {}
         results = [run({**reference, **spp}, seed) for seed in REFERENCE_SEEDS]
@@ -327,7 +327,7 @@ def _reference(reference: Any, run: Run) -> tuple[np.ndarray, np.ndarray, float]
     return picture, picture, 0.0 if variance is None else float(variance.mean()) ** 0.5
 
 
-def _picture(result: Result) -> np.ndarray:
+def _picture(result: Result) -> Array:
     bad = np.argwhere(~np.isfinite(result.image).all(axis=-1))
     if len(bad):
         raise MrtError(f"{len(bad)} pixels are NaN or infinite, the first at {tuple(bad[0].tolist())}")
@@ -335,9 +335,9 @@ def _picture(result: Result) -> np.ndarray:
 
 
 def _measure(
-    run: Run, cases: Mapping[str, Options], truth: np.ndarray, repeats: int, cold: bool, progress: Progress
+    run: Run, cases: Mapping[str, Options], truth: Array, repeats: int, cold: bool, progress: Progress
 ) -> tuple[dict[str, list[Result]], dict[str, str]]:
-    """Return the results of cases, of which the last ``repeats`` count, and why others failed.
+    """The results of cases, of which the last ``repeats`` count, and why others failed.
 
     Each runs first, perhaps with its kernels compiled anew and once more, then ``repeats`` times in turn, so
     that a load on the machine meets all alike.
@@ -363,9 +363,9 @@ def _measure(
 
 
 def _point(
-    name: str, runs: Sequence[Result], repeats: int, halves: Sequence[np.ndarray], own_error: float
+    name: str, runs: Sequence[Result], repeats: int, halves: Sequence[Array], own_error: float
 ) -> Point:
-    """Return the figures of a case; its first run was cold, its last ``repeats`` count."""
+    """The figures of a case; its first run was cold, its last ``repeats`` count."""
     counted = runs[-repeats:]
     image = counted[0].image
     pictures = np.array([result.image for result in counted], np.float64)  # [repeats, H, W, 3]
@@ -420,7 +420,7 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
 
 
 def _rows(found: Findings) -> list[dict[str, Any]]:
-    """Return the table of all cases, curve after curve."""
+    """The table of all cases, curve after curve."""
 
     def interval(ends: Interval) -> str:
         return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"

@@ -12,8 +12,9 @@ import numpy as np
 
 from mrt_mitsuba.plugins import fresnel
 from mrt_mitsuba.scene.model import Cone, Cylinder, Plane, Sphere
+from mrt_mitsuba.validation.checks.probe import direction
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.oracles.reference import unit
+from mrt_mitsuba.validation.oracles.reference import Array, dot, unit
 from mrt_mitsuba.validation.studies.roughconductor import ours as lobe
 from mrt_mitsuba.validation.studies.roughconductor import theirs as other_lobe
 from mrt_mitsuba.validation.studies.stability.geometry import MIRROR, ROUNDING, ends, lit, trace_of
@@ -32,7 +33,8 @@ NONE_RIGHT = 2.0**24  # roundings: no digit is right
 OFFSET = 1e-4  # of the first t, so that a ray does not meet the surface that it leaves
 WORST = 0.99  # the share of the rays that stay below what is shown
 
-Curves = dict[str, np.ndarray]  # roundings [places] by ``OURS``, ``THEIRS``, ``FIRST``
+Rays = tuple[Array, Array]  # origins and directions [N, 3], float32
+Curves = dict[str, Array]  # roundings [places] by ``OURS``, ``THEIRS``, ``FIRST``
 
 
 @dataclass(frozen=True)
@@ -47,50 +49,50 @@ class Axis:
     limit: float  #: that ours is promised to stay below, in roundings
 
 
-def curves(axis: Axis, *, places: int, count: int) -> tuple[np.ndarray, Curves]:
-    """Return places on an axis, and what nearly all samples stay below there, in roundings."""
+def curves(axis: Axis, *, places: int, count: int) -> tuple[Array, Curves]:
+    """Places on an axis, and the roundings that nearly all samples stay below there."""
     x = np.logspace(*axis.ends, places)
-    rows = [axis.measure(float(place), count) for place in x]
-    worst = {
-        name: np.array([np.quantile(row[name], WORST, method="lower") for row in rows])
-        for name in (OURS, THEIRS, FIRST)
-    }
-    return x, {name: np.clip(values, LEAST, NONE_RIGHT) for name, values in worst.items()}
+    with np.errstate(all="ignore"):  # formulas as first written break
+        rows = [axis.measure(float(place), count) for place in x]
+    worst = {}
+    for name in (OURS, THEIRS, FIRST):
+        quantiles = [np.quantile(row[name], WORST, method="lower") for row in rows]
+        worst[name] = np.clip(quantiles, LEAST, NONE_RIGHT)
+    return x, worst
 
 
 def show(study: Study, *, quick: bool, places: int = 0) -> None:
     """Add the diagram of all axes and its table to a study, and hold ours to what is promised."""
-    found = {
-        axis: curves(axis, places=places or (9 if quick else 33), count=24 if quick else 96)
-        for axis in study.each("Axes", AXES)
-    }
+    lines = {}
     rows = []
-    for axis, (x, lines) in found.items():
+    for axis in study.each("Axes", AXES):
+        x, line = curves(axis, places=places or (9 if quick else 33), count=24 if quick else 96)
+        lines[axis] = x, line
+        ours, theirs, first = (line[name].max() for name in (OURS, THEIRS, FIRST))
         why = "the limit of the tables below, in roundings; worst place of this axis"
-        study.at_most(f"roundings along the {axis.label}: {axis.title}", lines[OURS].max(), axis.limit, why)
-        broken = {name: x[values > 100 * axis.limit] for name, values in lines.items()}
-        rows.append(
-            {
-                "what": axis.title,
-                "along": axis.label,
-                "promised": axis.limit,
-                "ours, worst": lines[OURS].max(),
-                f"{THEIRS}, worst": lines[THEIRS].max(),
-                "nearest of Mitsuba's": axis.nearest,
-                "as first written, worst": lines[FIRST].max(),
-                "which breaks at": _span(broken[FIRST]),
-            }
-        )
+        study.at_most(f"roundings along the {axis.label}: {axis.title}", ours, axis.limit, why)
+        broken = x[line[FIRST] > 100 * axis.limit]
+        row = {
+            "what": axis.title,
+            "along": axis.label,
+            "promised": axis.limit,
+            "ours, worst": ours,
+            f"{THEIRS}, worst": theirs,
+            "nearest of Mitsuba's": axis.nearest,
+            "as first written, worst": first,
+            "which breaks at": f"{broken[0]:.0e} … {broken[-1]:.0e}" if len(broken) else "nowhere",
+        }
+        rows.append(row)
     caption = (
         "Blue: ours. Orange: what of Mitsuba's comes nearest. Grey, dashed: the formula as one would write "
         "it first, in float32. Dotted: what is promised of ours. At the top no digit is right any more."
     )
-    study.picture("roundings", "Error in roundings of float32 (6e-8), log scales", roundings(found), caption)
+    study.picture("roundings", "Error in roundings of float32 (6e-8), log scales", roundings(lines), caption)
     note = f"One rounding is 2⁻²⁴. {WORST:.0%} of the samples of a place stay below its figure."
     study.records("roundings", "Where it breaks, and where ours does not", rows, note, first=True)
 
 
-def roundings(found: Mapping[Axis, tuple[np.ndarray, Curves]]) -> Figure:
+def roundings(curves: Mapping[Axis, tuple[Array, Curves]]) -> Figure:
     """Draw errors in roundings of float32 along axes: a small plot for each, all with the same scale."""
     looks: dict[str, dict[str, Any]] = {
         FIRST: {"color": diagrams.GREY, "linestyle": (0, (4, 2)), "linewidth": 1.4},
@@ -98,7 +100,7 @@ def roundings(found: Mapping[Axis, tuple[np.ndarray, Curves]]) -> Figure:
         OURS: {"color": diagrams.COLORS[0], "linewidth": 2.4},
     }
     drawn, plots = diagrams.figure(2, 4, 14, 6.6)
-    for axes, (axis, (x, lines)) in zip(plots.flat, found.items(), strict=True):
+    for axes, (axis, (x, lines)) in zip(plots.flat, curves.items(), strict=True):
         axes.axhspan(0.1, axis.limit, color="#dcebf7", zorder=0)
         axes.axhline(axis.limit, color=diagrams.COLORS[0], linestyle=":", linewidth=1)
         for name, look in looks.items():
@@ -110,54 +112,48 @@ def roundings(found: Mapping[Axis, tuple[np.ndarray, Curves]]) -> Figure:
         axes.set_ylabel("error in roundings of float32")
         words = {"color": diagrams.GREY, "fontsize": diagrams.LABELS - 1, "va": "bottom", "ha": "right"}
         axes.text(0.98, NONE_RIGHT, "no digit is right", transform=axes.get_yaxis_transform(), **words)
-    for axes, (axis, (x, lines)) in zip(plots.flat, found.items(), strict=True):
+    for axes, (axis, (x, lines)) in zip(plots.flat, curves.items(), strict=True):
         names = {THEIRS: axis.nearest}
         marks = {names.get(n, n): (x[-1], lines[n][-1], looks[n]["color"]) for n in looks}
         diagrams.label_ends(axes, marks | {"promised": (x[-1], axis.limit, diagrams.COLORS[0])})
     return drawn
 
 
-def _span(places: np.ndarray) -> str:
-    return f"{places.min():.0e} … {places.max():.0e}" if len(places) else "nowhere"
-
-
-def _off(value: object, truth: np.ndarray) -> np.ndarray:
-    """Return relative errors in roundings; as many as there can be for values that are no numbers."""
-    error = np.abs(np.asarray(value, np.float64) / truth - 1) / ROUNDING
-    return np.where(np.isfinite(error), error, NONE_RIGHT)
+def _off(values: Mapping[str, object], truth: Array) -> Curves:
+    """Relative errors in roundings; as many as there can be for values that are no numbers."""
+    errors = {}
+    for name, value in values.items():
+        error = np.abs(np.asarray(value, np.float64) / truth - 1) / ROUNDING
+        errors[name] = np.where(np.isfinite(error), error, NONE_RIGHT)
+    return errors
 
 
 # ------------------------------------------ Reflectance ------------------------------------------
 
 
-def _pairs(count: int, cosine: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of directions [N, 3] whose half vector is within twice the slope alpha."""
+BSDFS = {OURS: lobe, THEIRS: other_lobe}
+
+
+def _pairs(count: int, cosine: Array, alpha: float) -> tuple[Array, Array]:
+    """Pairs of directions [N, 3] whose half vector is within twice the slope alpha."""
     rng = np.random.default_rng(11)
     phi, psi = rng.uniform(0, 2 * np.pi, (2, count))
-    sine = np.sqrt((1 - cosine) * (1 + cosine))
-    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=1)
+    wi = direction(cosine, phi)
     slope = 2 * alpha * np.sqrt(rng.random(count))
     m = unit(np.stack([slope * np.cos(psi), slope * np.sin(psi), np.ones(count)], axis=1))
-    wi32 = wi.astype(np.float32)
-    wo = (2 * (wi32 * m).sum(axis=1, keepdims=True) * m - wi32).astype(np.float32)
+    wo = np.float32(2 * dot(wi, m)[:, None] * m - wi)
     up = wo[:, 2] > 0
-    return wi32[up], wo[up]
+    return wi[up], wo[up]
 
 
-def _lobes(wi: np.ndarray, wo: np.ndarray, alpha: float) -> Curves:
-    """Return the roundings of the lobe D G / (4 cos θi), without Fresnel."""
+def _lobes(wi: Array, wo: Array, alpha: float) -> Curves:
+    """The roundings of the lobe D G / (4 cos θi), without Fresnel."""
     truth = np.array([_exact_lobe(*pair, alpha) for pair in zip(wi, wo, strict=True)])
-    with np.errstate(all="ignore"):
-        first = _first_lobe(wi, wo, np.float32(alpha))
-    found = {
-        OURS: evaluate(mi.load_dict(lobe(alpha)), wi, wo)[0][:, 0],
-        THEIRS: evaluate(mi.load_dict(other_lobe(alpha)), wi, wo)[0][:, 0],
-        FIRST: first,
-    }
-    return {name: _off(values, truth) for name, values in found.items()}
+    lobes = {name: evaluate(mi.load_dict(of(alpha)), wi, wo)[0][:, 0] for name, of in BSDFS.items()}
+    return _off({**lobes, FIRST: _first_lobe(wi, wo, np.float32(alpha))}, truth)
 
 
-def _exact_lobe(wi: np.ndarray, wo: np.ndarray, alpha: float) -> float:
+def _exact_lobe(wi: Array, wo: Array, alpha: float) -> float:
     a = exact.number(np.float32(alpha))
     x, y, z = (exact.number(p) + exact.number(q) for p, q in zip(wi, wo, strict=True))
     cosine = 1 / exact.mp.sqrt(1 + (x * x + y * y) / (z * z))
@@ -165,23 +161,19 @@ def _exact_lobe(wi: np.ndarray, wo: np.ndarray, alpha: float) -> float:
     return float(exact.beckmann_d(cosine, a) * g / (4 * exact.number(wi[2])))
 
 
-def _first_lobe(wi: np.ndarray, wo: np.ndarray, alpha: np.float32) -> np.ndarray:
-    """Return the lobe as the report has it, of cosines alone, in float32."""
-    half = wi + wo
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    c = half[:, 2]
+def _first_lobe(wi: Array, wo: Array, alpha: np.float32) -> Array:
+    """The lobe as the report has it, of cosines alone, in float32."""
+    c = unit(wi + wo)[:, 2]
     d = np.exp((c**2 - 1) / (c**2 * alpha**2)) / (np.float32(np.pi) * alpha**2 * c**4)
     g = _first_g1(wi[:, 2], alpha) * _first_g1(wo[:, 2], alpha)
-    return np.asarray(d * g / (4 * wi[:, 2] * wo[:, 2]) * wo[:, 2])
+    return d * g / (4 * wi[:, 2] * wo[:, 2]) * wo[:, 2]
 
 
-def _first_g1(cosine: np.ndarray, alpha: np.float32) -> np.ndarray:
+def _first_g1(cosine: Array, alpha: np.float32) -> Array:
     tangent = np.sqrt(1 - cosine**2) / cosine
     b = 1 / (alpha * tangent)
-    fit = (np.float32(3.535) * b + np.float32(2.181) * b**2) / (
-        1 + np.float32(2.276) * b + np.float32(2.577) * b**2
-    )
-    return np.where(b < np.float32(1.6), fit, np.float32(1))
+    fit = (3.535 * b + 2.181 * b**2) / (1 + 2.276 * b + 2.577 * b**2)
+    return np.where(b < 1.6, fit, 1)
 
 
 def roughness(alpha: float, count: int) -> Curves:
@@ -199,21 +191,17 @@ def grazing(cosine: float, count: int) -> Curves:
 def index(above: float, count: int) -> Curves:
     """Measure Fresnel's reflectance at an index of so much above 1."""
     n = np.float32(1 + above)
-    cosines = np.linspace(0.02, 1, count, dtype=np.float32)
-    truth = np.array([float(exact.fresnel_dielectric(c, 1, n)) for c in cosines])
-    one = np.float32(1)
-    c = cosines
-    with np.errstate(all="ignore"):
-        below = np.sqrt(one - (one / n) ** 2 * (one - c**2))
-        rs = ((c - n * below) / (c + n * below)) ** 2
-        rp = ((below - n * c) / (below + n * c)) ** 2
-        first = (rs + rp) / 2
-    found = {
-        OURS: fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(n)),
-        THEIRS: mi.fresnel(mi.Float(cosines), mi.Float(n))[0],
-        FIRST: first,
+    c = np.linspace(0.02, 1, count, dtype=np.float32)
+    truth = [float(exact.fresnel_dielectric(cosine, 1, n)) for cosine in c]
+    below = np.sqrt(1 - (1 / n) ** 2 * (1 - c**2))
+    rs = ((c - n * below) / (c + n * below)) ** 2
+    rp = ((below - n * c) / (below + n * c)) ** 2
+    reflectances = {
+        OURS: fresnel.fresnel_dielectric(mi.Float(c), 1, mi.Float(n)),
+        THEIRS: mi.fresnel(mi.Float(c), mi.Float(n))[0],
+        FIRST: (rs + rp) / 2,
     }
-    return {name: _off(values, truth) for name, values in found.items()}
+    return _off(reflectances, np.array(truth))
 
 
 # -------------------------------------------- Geometry --------------------------------------------
@@ -221,12 +209,12 @@ def index(above: float, count: int) -> Curves:
 
 def _hits(
     thing: Cone | Cylinder | Plane | Sphere,
-    rays: tuple[np.ndarray, np.ndarray],
-    distance: Callable[[np.ndarray], np.ndarray],
-    first: np.ndarray,
+    rays: Rays,
+    distance: Callable[[Array], Array],
+    first: Array,
     stock: Mapping[str, object] | None = None,
 ) -> Curves:
-    """Return how far hits of rays (o, d [N, 3], float32) are off a surface, in roundings of coordinates.
+    """How far hits of rays (o, d [N, 3], float32) are off a surface, in roundings of coordinates.
 
     ``distance``: of points [N, 3] from the surface, in float64; ``first``: t of a formula in float32.
     ``stock``: a shape of Mitsuba's, for what it has no shape of our own for: there it sees our mesh.
@@ -234,14 +222,10 @@ def _hits(
     o, d = rays
     scene = mi.load_dict(lit(f"{type(thing).__name__.lower()}s", thing, (9e6, 9e6, 9e6)))
     other = mi.load_dict({"type": "scene", "shape": dict(stock)}) if stock else scene
-    ray = mi.Ray3f(o.T, d.T)
-    found = {
-        OURS: np.array(trace_of(scene, o, d).hit.si.t),
-        THEIRS: np.array(other.ray_intersect(ray).t),
-        FIRST: first,
-    }
+    ours = np.array(trace_of(scene, o, d).hit.si.t)
+    theirs = np.array(other.ray_intersect(mi.Ray3f(o.T, d.T)).t)
     errors = {}
-    for name, t in found.items():
+    for name, t in ((OURS, ours), (THEIRS, theirs), (FIRST, first)):
         hit = np.isfinite(t) & (t > 0)
         p = o + np.where(hit, t, 0).astype(np.float64)[:, None] * d
         scale = np.maximum(np.abs(o).max(axis=1), np.abs(p).max(axis=1))
@@ -249,23 +233,17 @@ def _hits(
     return errors
 
 
-def _aimed(targets: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    o = eyes.astype(np.float32)
-    return o, unit(targets - o).astype(np.float32)
+def _aimed(targets: Array, eyes: Array) -> Rays:
+    o = np.float32(eyes)
+    return o, np.float32(unit(targets - o))
 
 
-def _quadratic(
-    a: np.ndarray, b: np.ndarray, c: np.ndarray, holds: Callable[[np.ndarray], np.ndarray] = np.isfinite
-) -> np.ndarray:
-    """Return the first root t by the formula of schoolbooks beyond an offset, in float32, which ``holds``.
-
-    Infinite without one.
-    """
-    with np.errstate(all="ignore"):
-        root = np.sqrt(b * b - 4 * a * c)
-        both = np.stack([(-b - root) / (2 * a), (-b + root) / (2 * a)])
-        both[~((both > OFFSET) & holds(both))] = np.inf
-    return np.asarray(both.min(axis=0))
+def _quadratic(a: Array, b: Array, c: Array, holds: Callable[[Array], Array] = np.isfinite) -> Array:
+    """The first root t beyond an offset that ``holds``, by a schoolbook's float32 formula; else infinity."""
+    root = np.sqrt(b * b - 4 * a * c)
+    both = np.stack([-b - root, -b + root]) / (2 * a)
+    both[~((both > OFFSET) & holds(both))] = np.inf
+    return both.min(axis=0)
 
 
 def sphere(scale: float, far: float, count: int) -> Curves:
@@ -275,16 +253,13 @@ def sphere(scale: float, far: float, count: int) -> Curves:
     across = unit(np.cross(eyes, rng.normal(size=(count, 3)))) * scale
     o, d = _aimed(across * rng.uniform(0, 0.9, (count, 1)), eyes)
     r = np.float32(scale)
-    a = (d * d).sum(axis=1)
-    b = 2 * (o * d).sum(axis=1)
-    c = (o * o).sum(axis=1) - r * r
+    first = _quadratic(dot(d, d), 2 * dot(o, d), dot(o, o) - r * r)
     ball = Sphere((0, 0, 0), float(r), MIRROR)
 
-    def distance(p: np.ndarray) -> np.ndarray:
-        return np.asarray(np.linalg.norm(p, axis=1) - float(r))
+    def distance(p: Array) -> Array:
+        return np.linalg.norm(p, axis=1) - ball.radius
 
-    stock = {"type": "sphere", "radius": float(r)}
-    return _hits(ball, (o, d), distance, _quadratic(a, b, c), stock)
+    return _hits(ball, (o, d), distance, first, {"type": "sphere", "radius": ball.radius})
 
 
 def floor(far: float, count: int) -> Curves:
@@ -293,8 +268,7 @@ def floor(far: float, count: int) -> Curves:
     normal = np.array([0.6, 0.64, 0.48])
     up = unit(normal.astype(np.float32).astype(np.float64))
     o, d = _aimed(far * unit(np.cross(rng.normal(size=(count, 3)), up)), np.tile(up, (count, 1)))
-    up32 = up.astype(np.float32)
-    first = -(o @ up32) / (d @ up32)
+    first = -(o @ np.float32(up)) / (d @ np.float32(up))
     turned = mi.ScalarTransform4f().look_at([0, 0, 0], up.tolist(), [0, 0, 1]).scale(2 * far)
     stock = {"type": "rectangle", "to_world": turned}
     return _hits(Plane(tuple(normal), 0.0, MIRROR), (o, d), lambda p: p @ up, first, stock)
@@ -316,8 +290,8 @@ def _axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Cur
     height = min(slender, 1.0)
     radius = min(1 / slender, 1.0)
     axis = unit(np.subtract(*ends(1.0)))
-    tip = (height / 2 * axis).astype(np.float32).astype(np.float64)
-    base = (-height / 2 * axis).astype(np.float32).astype(np.float64)
+    tip = np.float32(height / 2 * axis).astype(np.float64)
+    base = -tip
     along = unit(tip - base)
     height = float(np.linalg.norm(tip - base))
     outwards = unit(np.cross(along, rng.normal(size=(count, 3))))
@@ -328,35 +302,36 @@ def _axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Cur
     eyes = targets + 3 * unit(normal + 0.3 * rng.normal(size=(count, 3)))
     rays = _aimed(targets, eyes)
 
-    def distance(p: np.ndarray) -> np.ndarray:
+    def distance(p: Array) -> Array:
         depth = (tip - p) @ along
         r = np.linalg.norm(p - tip + depth[:, None] * along, axis=1)
         if kind is Cylinder:
-            return np.asarray(r - radius)
-        return np.asarray((r * height - depth * radius) / np.hypot(height, radius))
+            return r - radius
+        return (r * height - depth * radius) / np.hypot(height, radius)
 
-    tangent = np.float32(radius / height) if kind is Cone else np.float32(0)
-    first = _first_side(rays, tip, along, tangent, np.float32(0 if kind is Cone else radius))
-    stock = {"type": "cylinder", "p0": base, "p1": tip, "radius": radius} if kind is Cylinder else None
+    stock: dict[str, object] | None = None
+    slope, wide = radius / height, 0.0
+    if kind is Cylinder:
+        slope, wide = 0.0, radius
+        stock = {"type": "cylinder", "p0": base, "p1": tip, "radius": radius}
+    first = _first_side(rays, tip, along, np.float32(slope), np.float32(wide))
     thing = kind(tuple(tip.tolist()), tuple(base.tolist()), radius, MIRROR)
     return _hits(thing, rays, distance, first, stock)
 
 
-def _first_side(
-    rays: tuple[np.ndarray, np.ndarray], tip: np.ndarray, axis: np.ndarray, tangent: np.float32, r: np.float32
-) -> np.ndarray:
-    """Return t of |q|² = (r + tangent · depth)², q across the axis, as one would write it first."""
+def _first_side(rays: Rays, tip: Array, axis: Array, tangent: np.float32, r: np.float32) -> Array:
+    """Distances t of |q|² = (r + tangent · depth)², q across the axis, as one would write it first."""
     o, d = rays
-    axis32 = -axis.astype(np.float32)
-    from_tip = o - tip.astype(np.float32)
-    depth = from_tip @ axis32
-    faster = d @ axis32
-    q = from_tip - depth[:, None] * axis32
-    across = d - faster[:, None] * axis32
+    down = -np.float32(axis)
+    from_tip = o - np.float32(tip)
+    depth = from_tip @ down
+    faster = d @ down
+    q = from_tip - depth[:, None] * down
+    across = d - faster[:, None] * down
     k = tangent**2
-    a = (across**2).sum(axis=1) - k * faster**2
-    b = 2 * ((q * across).sum(axis=1) - k * depth * faster)
-    c = (q**2).sum(axis=1) - k * depth**2 - r * r
+    a = dot(across, across) - k * faster**2
+    b = 2 * (dot(q, across) - k * depth * faster)
+    c = dot(q, q) - k * depth**2 - r * r
     return _quadratic(a, b, c, lambda t: depth + t * faster >= 0)  # one half of a double cone
 
 

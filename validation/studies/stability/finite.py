@@ -115,7 +115,7 @@ def bad_lanes(form: str, visible: bool, count: int, seed: int) -> int:
     generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
 
     def mixed(ordinary: Callable[[mi.Float], mi.Float], extremes: Sequence[float]) -> mi.Float:
-        """Return a function of uniform numbers, in every third lane an extreme."""
+        """A function of uniform numbers, in every third lane an extreme."""
         found = ordinary(generator.next_float32())
         table = mi.Float(np.array(extremes, np.float32))
         index = mi.UInt32(generator.next_float32() * 3 * len(extremes))

@@ -52,7 +52,7 @@ def scaled(factor: float) -> Place:
 
 
 def moved(sizes: float) -> Place:
-    """Return a place so many scene sizes away, of which too many leave no digits for the scene."""
+    """A place so many scene sizes away, of which too many leave no digits for the scene."""
     step = sizes * 2**-23
     why = f"coordinates have steps of {step:.0e} scene sizes there: normals and outlines move"
     most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
@@ -113,7 +113,7 @@ SOLIDS: dict[str, Callable[[float], Any]] = {
 
 
 def ends(size: float) -> tuple[Any, Any]:
-    """Return the ends of an axis aslant."""
+    """The ends of an axis aslant."""
     return (0.1 * size, 0.6 * size, -0.2 * size), (-0.1 * size, -0.4 * size, 0.2 * size)
 
 
@@ -143,7 +143,7 @@ def picture(scene: Scene) -> np.ndarray:
 
 
 def placed(scene: Scene, factor: float, sizes: float) -> Scene:
-    """Return the scene with all lengths multiplied, or shifted by a multiple of its size, along no axis.
+    """The scene with all lengths multiplied, or shifted by a multiple of its size, along no axis.
 
     Its size: the distance from the camera to what it looks at.
     """
@@ -166,7 +166,7 @@ def placed(scene: Scene, factor: float, sizes: float) -> Scene:
 
 
 def measure(kind: str, size: float, count: int) -> Figures:
-    """Return the figures of rays at one size, from all distances."""
+    """The figures of rays at one size, from all distances."""
     # None is on the surface
     distances = [1.5 * x if x == size else x for x in DECADES if x <= FARTHEST * size]
     starts, ways = zip(*(_rays(size, x, count) for x in distances), strict=True)
@@ -212,14 +212,14 @@ def measure(kind: str, size: float, count: int) -> Figures:
 
 
 def _alone(kind: str, thing: Any, light: np.ndarray, size: float) -> mi.Scene:
-    """Return a scene with a thing under a light, and another so small and far off that no ray meets it."""
+    """A scene with a thing under a light, and another so small and far off that no ray meets it."""
     nodes = lit(kind, thing, light.tolist())
     aside = {"type": "sphere", "center": [1.7 * size] * 3, "radius": 1e-3 * size, "flip_normals": True}
     return mi.load_dict(nodes | {"aside": aside})
 
 
 def lit(kind: str, thing: Any, light: Sequence[float]) -> dict[str, Any]:
-    """Return the nodes of a scene of a thing, of a kind as in ``SOLIDS``, under a light."""
+    """The nodes of a scene of a thing, of a kind as in ``SOLIDS``, under a light."""
     x, y, z = light
     empty: Any = Scene(Camera((0, 0, 9), (0, 0, 0)), (0, 0, 0), (Light((x, y, z), (1, 1, 1)),))
     nodes: dict[str, Any] = replace(empty, **{kind: (thing,)}).to_dict(fresnel="unity")
@@ -227,13 +227,13 @@ def lit(kind: str, thing: Any, light: Sequence[float]) -> dict[str, Any]:
 
 
 def trace_of(scene: mi.Scene, o: np.ndarray, d: np.ndarray) -> Any:
-    """Return what ``mrt_whitted`` finds along rays (o, d [N, 3])."""
+    """The trace of ``mrt_whitted`` along rays (o, d [N, 3])."""
     whitted = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0, "bounce_budget": "plain"})
     return whitted.trace(scene, None, mi.Ray3f(o.T, d.T))
 
 
 def _rays(size: float, distance: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return rays (o [N, 3], d [N, 3]) from a distance to all parts of an object, a third to its outline."""
+    """Rays (o [N, 3], d [N, 3]) from a distance to all parts of an object, a third to its outline."""
     rng = np.random.default_rng(7)
     towards, across, anywhere = (unit(rng.normal(size=(count, 3))) for _ in range(3))
     o = (distance * towards).astype(np.float32)

@@ -67,14 +67,14 @@ def cases(quick: bool) -> Iterator[Case]:
 
 
 def fresnel_error(cosines: np.ndarray, iors: np.ndarray) -> float:
-    """Return the largest relative error of the dielectric term."""
+    """The largest relative error of the dielectric term."""
     truth = [float(exact.fresnel_dielectric(c, 1, n)) for c, n in zip(cosines, iors, strict=True)]
     found = np.array(fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors)), np.float64)
     return float(np.abs(found / truth - 1).max())
 
 
 def errors(lobes: Arrays) -> Arrays:
-    """Return the relative errors [N] of the plugin and its functions, by quantity."""
+    """The relative errors [N] of the plugin and its functions, by quantity."""
     alpha = mi.Float(lobes["alpha"])
     wi = mi.Vector3f(lobes["wi"].T)
     wo = mi.Vector3f(lobes["wo"].T)
@@ -112,7 +112,7 @@ CHUNK = 2**24
 
 
 def largest_error(formula: Callable[[Any], Any], stride: int) -> float:
-    """Return the largest |float32 − float64| over the step of float32 there, for every ``stride``-th cosine.
+    """The largest |float32 − float64| over the step of float32 there, for every ``stride``-th cosine.
 
     In float64, its own error is below 1e-6 of a float32 step: nothing in these forms cancels but 1 − c, which
     is exact, and what is small next to its sum. LLVM kernels take what is below the least number with all its

@@ -45,7 +45,7 @@ def _ball(**changes: Any) -> Scene:
 
 
 def _shiny(**changes: Any) -> Scene:
-    """Return a material without a diffuse part, which would hide the lobe."""
+    """A material without a diffuse part, which would hide the lobe."""
     return replace(_ball(diffuse=(0, 0, 0), specular=(1, 1, 1), **changes), sky=(0, 0, 0))
 
 
@@ -69,7 +69,7 @@ def _under(outwards: float) -> Scene:
 
 
 def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
-    """Return two mirrors that face each other, with a ball and the camera between them."""
+    """Two mirrors that face each other, with a ball and the camera between them."""
     material = replace(MIRROR, ior=ior, specular=(specular, 0.95 * specular, 0.9 * specular))
     walls = (Plane((0, 0, 1), 2.0, material), Plane((0, 0, -1), 2.0, material), Plane((0, 1, 0), 1.0, GREY))
     ball = Sphere((0.3, -0.2, -0.5), 0.4, GREY)
@@ -94,12 +94,12 @@ class Path:
     exact: Scene | None = None  #: the scene whose exact picture it is, if not this one
 
     def truth(self, scene: Scene, **settings: Any) -> np.ndarray:
-        """Return the picture [H, W, 3] of a scene by the float64 tracer, with other settings than its own."""
+        """The picture [H, W, 3] of a scene by the float64 tracer, with other settings than its own."""
         chosen = {"fresnel": "dielectric", "clamp": True, **self.settings, **settings}
         return reference_render(scene, width=WIDTH, height=HEIGHT, **chosen).image
 
     def rendered(self) -> np.ndarray:
-        """Return our picture [H, W, 3]."""
+        """Our picture [H, W, 3]."""
         fresnel = self.settings.get("fresnel", "dielectric")
         nodes = self.scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=fresnel)
         clamp = self.settings.get("clamp", True)
@@ -177,7 +177,7 @@ def cases(quick: bool) -> Iterator[Case]:
 
 
 def difference(image: np.ndarray, truth: np.ndarray) -> float:
-    """Return the largest difference in a channel that 95 % of the pixels stay below; inf for bad values."""
+    """The largest difference in a channel that 95 % of the pixels stay below; inf for bad values."""
     if not (np.isfinite(image) & (image >= 0)).all():
         return np.inf
     return float(np.quantile((np.abs(image - truth) / (truth + SMALL)).max(axis=-1), SHARE))
