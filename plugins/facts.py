@@ -40,12 +40,10 @@ class Reading:
         analytic = {id(s) for s in (*self.planes, *self.quadrics)}
         self.native = [s for s in snapshot.shapes if id(s) not in analytic]
         #: the rows of the materials by shape, none where they have no place in one table
-        self.materials, of_materials = kept(
-            "material facts", (shapes, materials), lambda: _read_materials(snapshot)
-        )
+        self.materials, of_materials = kept("material facts", (shapes, materials), _read_materials, snapshot)
         of_shapes = kept("shape facts", shapes, self._read_shapes)
         #: the lights, and their rows where all have one
-        self.lights, self.light_rows, of_lights = kept("light facts", lights, lambda: _read_lights(snapshot))
+        self.lights, self.light_rows, of_lights = kept("light facts", lights, _read_lights, snapshot)
         self.facts = SceneFacts(**of_lights, **of_materials, **of_shapes, pinhole=snapshot.eye is not None)
 
     def _read_shapes(self) -> dict[str, Any]:

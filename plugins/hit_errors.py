@@ -61,16 +61,14 @@ class HitErrors:
 
 def _sizes_across(corners: np.ndarray) -> list[float]:
     """Return w and c of triangles."""
-    edges = np.stack([corners[:, k] - corners[:, k - 1] for k in range(3)], axis=1)  # [n, 3, 3]
+    edges = corners - np.roll(corners, 1, axis=1)  # [n, 3, 3]
     width = np.abs(edges).max(axis=1, initial=0.0)  # [n, 3]
-    a = edges[:, 0]
-    b = edges[:, 1]
-    normal = np.linalg.norm(np.cross(a, b), axis=1)
+    normal = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     # What the components of a cross product lose, by the extents that they are multiplied with
-    lost = 0
-    for i in range(3):
-        products = np.abs(a[:, i - 2] * b[:, i - 1]) + np.abs(a[:, i - 1] * b[:, i - 2])
-        lost = lost + width[:, i] * products
+    a = np.abs(edges[:, 0])
+    b = np.abs(edges[:, 1])
+    products = np.roll(a, 2, axis=1) * np.roll(b, 1, axis=1) + np.roll(a, 1, axis=1) * np.roll(b, 2, axis=1)
+    lost = (width * products).sum(axis=1)
     condition = np.divide(lost, normal, out=np.zeros_like(lost), where=normal > 0)
     width = width.max(axis=0, initial=0.0)
     return [*width.tolist(), float(condition.max(initial=0.0) + LEAST * width.max())]

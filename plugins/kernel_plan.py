@@ -21,7 +21,9 @@ UNROLLED_LIGHTS = 8
 # With fewer objects, looking up what is in the way of a light takes as long as searching for it; with more
 # pairs of an object and a light, the lists are too long for a processor's caches; with more objects than
 # ``MOST_SEEN``, those around the eye take longer to make than they save
-LEAST_BUFFERED, MOST_PAIRS, MOST_SEEN = 64, 2**17, 2**14
+LEAST_BUFFERED = 64
+MOST_PAIRS = 2**17
+MOST_SEEN = 2**14
 
 BUDGETS = ("report", "plain")
 
@@ -144,14 +146,18 @@ class Case:
 Reasons = dict[str, bool]  # against something, by whether they hold; the first that holds is given
 
 
+# What kernels hold, in words: a format of ``facts`` and ``plan``, one for each value of the field, or a
+# function of facts and plan, which gives "" for nothing
+Content = str | dict[str, str] | Callable[[SceneFacts, KernelPlan], str]
+
+
 @dataclass(frozen=True)
 class Rule:
     """A decision."""
 
     name: str  #: the field of the plan
     what: str  #: what is decided, in words
-    #: what kernels hold, in words: a format of ``facts`` and ``plan``, or a function of them; "" for nothing
-    content: str | Callable[[SceneFacts, KernelPlan], str]
+    content: Content
     against: Callable[[Case], Reasons]
     value: Callable[[Case, bool], Any]  # of the field, by whether there is no reason against it
 
@@ -166,14 +172,13 @@ def _free(case: Case, free: bool) -> bool:
 def rule(
     name: str,
     what: str,
-    content: str | Callable[[SceneFacts, KernelPlan], str],
+    content: Content,
     value: Callable[[Case, bool], Any] = _free,
-) -> Callable[[Callable[[Case], Reasons]], Callable[[Case], Reasons]]:
+) -> Callable[[Callable[[Case], Reasons]], None]:
     """Put a decision into ``RULES``, by the function that gives the reasons against it."""
 
-    def add(against: Callable[[Case], Reasons]) -> Callable[[Case], Reasons]:
+    def add(against: Callable[[Case], Reasons]) -> None:
         RULES.append(Rule(name, what, content, against, value))
-        return against
 
     return add
 
@@ -182,12 +187,10 @@ def rule(
 
 _OTHERS = "other shapes, or spheres that emit or face inwards"
 
-
-_SPHERES = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
-
-
-def _sphere_content(facts: SceneFacts, plan: KernelPlan) -> str:
-    return _SPHERES[plan.spheres]
+_SPHERES: Content = {
+    "table": "spheres from a table of centres and radii",
+    "corrected": "hits moved onto spheres",
+}
 
 
 def _sphere_form(case: Case, free: bool) -> str:
@@ -196,7 +199,7 @@ def _sphere_form(case: Case, free: bool) -> str:
     return "corrected" if case.facts.spheres else "none"
 
 
-@rule("spheres", "table of spheres", _sphere_content, _sphere_form)
+@rule("spheres", "table of spheres", _SPHERES, _sphere_form)
 def _spheres(case: Case) -> Reasons:
     facts = case.facts
     return {
@@ -208,11 +211,11 @@ def _spheres(case: Case) -> Reasons:
     }
 
 
-_LIGHTS = {"unrolled": "unrolled", "loop": "in a loop of calls", "table": "in a loop over a table"}
-
-
-def _light_content(facts: SceneFacts, plan: KernelPlan) -> str:
-    return f"{facts.lights} lights, {_LIGHTS[plan.lights]}"
+_LIGHTS: Content = {
+    "unrolled": "{facts.lights} lights, unrolled",
+    "loop": "{facts.lights} lights, in a loop of calls",
+    "table": "{facts.lights} lights, in a loop over a table",
+}
 
 
 def _light_form(case: Case, free: bool) -> str:
@@ -224,7 +227,7 @@ def _light_form(case: Case, free: bool) -> str:
     return "table" if facts.tabled else "loop"
 
 
-@rule("lights", "shadow rays", _light_content, _light_form)
+@rule("lights", "shadow rays", _LIGHTS, _light_form)
 def _lights(case: Case) -> Reasons:
     return {"no light": case.facts.lights == 0, "every material is black": not case.lobes}
 
@@ -340,11 +343,7 @@ def _emission(case: Case) -> Reasons:
     return {"no surface emits": case.facts.surface_emitters == 0}
 
 
-_SKY = {"parameter": "the integrator's sky", "environment": "the scene's sky"}
-
-
-def _sky_content(facts: SceneFacts, plan: KernelPlan) -> str:
-    return _SKY[plan.sky]
+_SKY: Content = {"parameter": "the integrator's sky", "environment": "the scene's sky"}
 
 
 def _sky_source(case: Case, free: bool = True) -> str:
@@ -353,7 +352,7 @@ def _sky_source(case: Case, free: bool = True) -> str:
     return "environment" if case.facts.environment else "none"
 
 
-@rule("sky", "sky", _sky_content, _sky_source)
+@rule("sky", "sky", _SKY, _sky_source)
 def _sky(case: Case) -> Reasons:
     return {"no sky in the scene": _sky_source(case) == "none"}
 
@@ -406,10 +405,13 @@ def contents(plan: KernelPlan, facts: SceneFacts) -> list[str]:
     """Return a line for each thing that the kernels hold."""
     lines = []
     for each in RULES:
-        if getattr(plan, each.name) in (False, "none", ()):
+        value = getattr(plan, each.name)
+        if value in (False, "none", ()):
             continue
-        if isinstance(each.content, str):
-            lines.append(each.content.format(facts=facts, plan=plan))
-        else:
-            lines.append(each.content(facts, plan))
-    return [line for line in lines if line]
+        content = each.content
+        if isinstance(content, dict):
+            content = content[value]
+        line = content.format(facts=facts, plan=plan) if isinstance(content, str) else content(facts, plan)
+        if line:
+            lines.append(line)
+    return lines

@@ -13,7 +13,7 @@ from .intersect import LATERAL, Frame
 from .point_buffer import PointBuffer
 from .quadric_kinds import KINDS
 from .tree import Tree
-from .variants import aligned, is_jit, shape_ids
+from .variants import aligned, is_jit, put_where, shape_ids
 
 if TYPE_CHECKING:
     from .exact_mesh import ExactMesh
@@ -114,7 +114,6 @@ class Quadrics:
         for number, moving in self.moving:
             rows = zip((moving.origin, moving.x, moving.y, moving.z), vars(frame).values(), strict=True)
             frame = Frame(*(dr.select(leaf == number, mi.Vector3f(a), mi.Vector3f(b)) for a, b in rows))
-
         if self.moving:
             # The hit goes along the ray as the surface moves
             met = ray.o + ray.d * t
@@ -127,20 +126,13 @@ class Quadrics:
             si.dp_dv = dr.select(where, frame.to_world(by_v), si.dp_dv)
         if self.flipped:
             n *= side
-        normal = mi.Normal3f(n)
-        si.t = dr.select(where, t, si.t)
-        si.p = dr.select(where, p, si.p)
-        si.n = dr.select(where, normal, si.n)
-        si.sh_frame.n = dr.select(where, normal, si.sh_frame.n)
-        si.uv = dr.select(where, mi.Point2f(u, v), si.uv)
-        if not is_jit():
-            si.shape = self.shapes[leaf]
-            si.prim_index = self.faces[leaf]
-            return
-        shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.shapes, leaf, where))
-        face = dr.gather(mi.UInt32, self.faces, leaf, where)
-        si.shape = dr.select(where, shape, si.shape)
-        si.prim_index = dr.select(where, face, si.prim_index)
+        if is_jit():
+            shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.shapes, leaf, where))
+            face = dr.gather(mi.UInt32, self.faces, leaf, where)
+        else:
+            shape = self.shapes[leaf]
+            face = self.faces[leaf]
+        put_where(where, si, t=t, p=p, n=mi.Normal3f(n), uv=mi.Point2f(u, v), shape=shape, prim_index=face)
 
     def _row(self, leaf: mi.UInt32, active: mi.Bool = True) -> tuple[Frame, mi.Float, mi.Float]:
         """Return frame, kind and side of the normal."""

@@ -57,29 +57,21 @@ class SceneData:
         self.differentiated = any(part.differentiated for part in parts)  #: are derivatives wanted
         self._form = form = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
         # The shapes by who traces them; ``bvh``: a scene of those that only Mitsuba can, or None for all
-        self.bvh, self.planes, self.quadrics, self.errors, self.spheres = kept(
-            "traced", form, lambda: _trace(reading, plan)
-        )
+        traced = kept("traced", form, _trace, reading, plan)
+        self.bvh, self.planes, self.quadrics, self.errors, self.spheres = traced
         lit = now.light_part, plan.lights
-        self.lights: Lights = kept("lights", lit, lambda: Lights(reading.lights, reading.light_rows, lit[1]))
+        self.lights = kept("lights", lit, Lights, reading.lights, reading.light_rows, plan.lights)
         # Lists of what may be in the way of the lights, with what tests it
         things = [thing for thing in (self.quadrics, self.spheres) if thing is not None and plan.buffers]
         places = np.array([row[0] for row in reading.light_rows or ()])
-        self.buffers: list[tuple[PointBuffer, Any]] = kept(
-            "buffers",
-            (now.light_part, plan.buffers, *form),
-            lambda: [(PointBuffer(places, *thing.boxes()), thing) for thing in things],
-        )
-        seen = self.quadrics if plan.eye else None
-        around = (now.eye, plan.eye, *form)
-        self.eye: PointBuffer | None = kept(
-            "eye", around, lambda: None if seen is None else PointBuffer(np.array([now.eye]), *seen.boxes())
-        )
-        self.merged = kept(
-            "merged",
-            (now.shape_part, now.material_part, plan.merged),
-            lambda: MaterialTable(now.shapes, reading.materials) if plan.merged else None,
-        )
+        self.buffers = kept("buffers", (now.light_part, plan.buffers, *form), _buffers, places, things)
+        seen = [self.quadrics] if plan.eye else []
+        around = kept("eye", (now.eye, plan.eye, *form), _buffers, np.array([now.eye]), seen)
+        self.eye = around[0][0] if around else None
+        self.merged: MaterialTable | None = None
+        if plan.merged:
+            of_materials = now.shape_part, now.material_part
+            self.merged = kept("merged", of_materials, MaterialTable, now.shapes, reading.materials)
         self.path_limit: Any = plan.cut_off[0]
         if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
             self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
@@ -97,7 +89,7 @@ class SceneData:
         tabled = tabled and (plan.spheres == "table" or not plan.bvh)
         if not tabled or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
             return None
-        rays = self._kept("rays", self._form, lambda: _ray_arrays(self.bvh or scene)) if plan.bvh else []
+        rays = self._kept("rays", self._form, _ray_arrays, self.bvh or scene) if plan.bvh else []
         own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged]
         return [*_arrays_in([*own, self.buffers, self.eye]), *rays, self.path_limit, sky]
 
@@ -231,6 +223,11 @@ def _trace(reading: Reading, plan: KernelPlan) -> tuple:
             thing.set_id(name)
     spheres = Spheres(others) if plan.spheres != "none" else None
     return bvh, Planes(planes), Quadrics(exact) if exact else None, HitErrors(others), spheres
+
+
+def _buffers(places: np.ndarray, things: list[Any]) -> list[tuple[PointBuffer, Any]]:
+    """Return lists of things as seen from places, by kind, with what tests them."""
+    return [(PointBuffer(places, *thing.boxes()), thing) for thing in things]
 
 
 def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:

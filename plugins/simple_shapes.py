@@ -11,7 +11,7 @@ import numpy as np
 
 from .intersect import intersect_plane
 from .snapshot import parameters_of
-from .variants import ByShape, Table, first
+from .variants import ByShape, Table, first, put_where
 
 if TYPE_CHECKING:
     from .plane import MrtPlane
@@ -74,17 +74,13 @@ class Planes:
         p = dr.fma(ray.d, ray.maxt, ray.o)
         # Along a grazing ray the error of t is far larger than that of the plane
         p -= n * _height(p, n, distance)
-        si.t = dr.select(where, ray.maxt, si.t)
-        si.p = dr.select(where, p, si.p)
-        si.n = dr.select(where, mi.Normal3f(n), si.n)
-        si.sh_frame.n = dr.select(where, mi.Normal3f(n), si.sh_frame.n)
         along = [tangent(index, where) for tangent in self.tangents]
         if tangents:
             pairs = zip(along, (si.dp_du, si.dp_dv), strict=True)
             si.dp_du, si.dp_dv = (dr.select(where, *pair) for pair in pairs)
         uv = mi.Point2f(*(dr.dot(tangent, p) for tangent in along))
-        si.uv = dr.select(where, uv, si.uv)
-        si.shape = dr.select(where, self.shapes(index, where), si.shape)
+        shape = self.shapes(index, where)
+        put_where(where, si, t=ray.maxt, p=p, n=mi.Normal3f(n), uv=uv, shape=shape)
         return dr.select(where, dr.abs(distance), scale)
 
 

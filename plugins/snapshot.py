@@ -158,12 +158,12 @@ class Snapshot:
 class Kept(dict[str, tuple[Hashable, Any]]):
     """What was made last of something, under a key that names all that it depends on."""
 
-    def __call__(self, name: str, key: Hashable, make: Callable[[], Value]) -> Value:
-        """Return what ``make()`` returns, or returned last if the key is the same."""
+    def __call__(self, name: str, key: Hashable, make: Callable[..., Value], *arguments: object) -> Value:
+        """Return ``make(*arguments)``, made last time if the key was the same."""
         known = self.get(name)
         if known is None or known[0] != key:
             # Key and value come together or, where ``make`` is interrupted, not at all
-            known = self[name] = key, make()
+            known = self[name] = key, make(*arguments)
         return known[1]
 
 

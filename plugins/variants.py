@@ -39,6 +39,13 @@ def but_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
     return mask & ~excluded if is_jit() else mask and not excluded
 
 
+def put_where(where: mi.Bool, si: mi.SurfaceInteraction3f, **fields: object) -> None:
+    """Overwrite fields of an interaction where a mask holds; the normal ``n`` also for shading."""
+    for name, value in fields.items():
+        setattr(si, name, dr.select(where, value, getattr(si, name)))
+    si.sh_frame.n = dr.select(where, fields["n"], si.sh_frame.n)
+
+
 def varies(value: object) -> bool:
     """Return whether a value is a texture that may vary over a surface.
 

@@ -6,6 +6,8 @@ import contextlib
 import math
 import signal
 from dataclasses import dataclass
+from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import drjit as dr
@@ -218,10 +220,15 @@ class MrtWhitted(mi.SamplingIntegrator):
         state, hit = follow(state, data.eye)
         direct = state["radiance"]
         if data.plan.mirrors:
+
+            def bounce(s: dict) -> tuple[dict]:
+                after, _ = follow(s)
+                return (after | {"bounces": s["bounces"] + 1},)
+
             (state,) = dr.while_loop(
                 (state,),
-                lambda s: s["active"],
-                lambda s: (follow(s)[0] | {"bounces": s["bounces"] + 1},),
+                itemgetter("active"),
+                bounce,
                 label="mirror bounces",
                 # Derivatives are propagated backwards through as many, whose state is stored
                 max_iterations=self.max_depth if data.differentiated else None,
@@ -246,21 +253,17 @@ class MrtWhitted(mi.SamplingIntegrator):
         ``throughput`` is that of the path up to ``hit``.
         """
 
-        def missed(hit: Hit, path: mi.UnpolarizedSpectrum, sampler: mi.Sampler) -> tuple:
+        def pass_by(hit: Hit, throughput: mi.UnpolarizedSpectrum, sampler: mi.Sampler) -> tuple:
             # Dr.Jit writes results into what a branch returns, and runs branches anew for derivatives: two
             # objects, made here
-            black, no_mirror = mi.UnpolarizedSpectrum(0), mi.UnpolarizedSpectrum(0)
-            return (black, mi.UInt32(0), no_mirror, mi.UInt32(0)), sampler
+            black = mi.UnpolarizedSpectrum(0)
+            no_mirror = mi.UnpolarizedSpectrum(0)
+            return black, mi.UInt32(0), no_mirror, mi.UInt32(0), sampler
 
         # A branch, because packets whose rays all miss are many
         state = hit, throughput, sampler if data.plan.random else None
-        (radiance, *others), _ = dr.if_stmt(
-            state,
-            hit.found,
-            lambda hit, path, sampler: (self._shade_surface(data, scene, sampler, hit, path), sampler),
-            missed,
-            label="surface",
-        )
+        shade = partial(self._shade_surface, data, scene)
+        radiance, *others, _ = dr.if_stmt(state, hit.found, shade, pass_by, label="surface")
         if data.plan.sky != "none":
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.wi = -ray.d
@@ -274,10 +277,10 @@ class MrtWhitted(mi.SamplingIntegrator):
         self,
         data: SceneData,
         scene: mi.Scene,
-        sampler: mi.Sampler,
         hit: Hit,
         throughput: mi.UnpolarizedSpectrum,
-    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32]:
+        sampler: mi.Sampler,
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32, mi.Sampler]:
         plan = data.plan
         si = hit.si
         radiance = mi.UnpolarizedSpectrum(0)
@@ -323,13 +326,14 @@ class MrtWhitted(mi.SamplingIntegrator):
             light_here, traced = lit(light, sample, value)
             return light + 1, radiance + light_here, shadow_rays + traced, sampler
 
+        def is_left(light: mi.UInt32, *_: object) -> mi.Bool:
+            return hit.found & (light < data.lights.count)
+
         if plan.lights in ("loop", "table"):
             state = mi.UInt32(0), radiance, shadow_rays, sampler if plan.random else None
-            _, radiance, shadow_rays, _ = dr.while_loop(
-                state, lambda light, *_: hit.found & (light < data.lights.count), step, label="lights"
-            )
+            _, radiance, shadow_rays, sampler = dr.while_loop(state, is_left, step, label="lights")
         cost = mi.UInt32(1)
         if self.bounce_budget == "report":
             tenths = mi.Int32(dr.minimum(10 * int_ior, 10))
             cost = mi.UInt32(dr.maximum(10 - tenths, 1))
-        return radiance, shadow_rays, reflectance, cost
+        return radiance, shadow_rays, reflectance, cost, sampler
