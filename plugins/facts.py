@@ -44,7 +44,13 @@ class Reading:
         of_shapes = kept("shape facts", shapes, self._read_shapes)
         #: the lights, and their rows where all have one
         self.lights, self.light_rows, of_lights = kept("light facts", lights, _read_lights, snapshot)
-        self.facts = SceneFacts(**of_lights, **of_materials, **of_shapes, pinhole=snapshot.eye is not None)
+        self.facts = SceneFacts(
+            **of_lights,
+            **of_materials,
+            **of_shapes,
+            pinhole=snapshot.eye is not None,
+            differentiated=any(part.differentiated for part in (shapes, materials, lights)),
+        )
 
     def _read_shapes(self) -> dict[str, Any]:
         """Return the facts about the shapes."""

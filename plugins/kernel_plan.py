@@ -66,6 +66,7 @@ class SceneFacts:
     textured: bool  #: does a material vary over its surface
     two_sided: bool  #: is a material lit from behind
     unmergeable: str  #: why the materials have no place in one table; "" where they do
+    differentiated: bool  #: are derivatives wanted
 
 
 @dataclass(frozen=True)
@@ -222,7 +223,8 @@ def _light_form(case: Case, free: bool) -> str:
     facts = case.facts
     if not free:
         return "none"
-    if facts.lights <= UNROLLED_LIGHTS or not facts.vectorised:
+    # Dr.Jit has no derivatives through a loop of such calls
+    if facts.lights <= UNROLLED_LIGHTS or not facts.vectorised or facts.differentiated:
         return "unrolled"
     return "table" if facts.tabled else "loop"
 

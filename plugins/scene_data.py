@@ -52,9 +52,7 @@ class SceneData:
         self.facts = reading.facts
         self.environment = now.environment
         self._kept = kept
-        parts = now.shape_part, now.material_part, now.light_part
         self.known = now.material_part.known and now.light_part.known
-        self.differentiated = any(part.differentiated for part in parts)  #: are derivatives wanted
         self._form = form = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
         # The shapes by who traces them; ``bvh``: a scene of those that only Mitsuba can, or None for all
         traced = kept("traced", form, _trace, reading, plan)

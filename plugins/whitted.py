@@ -231,7 +231,7 @@ class MrtWhitted(mi.SamplingIntegrator):
                 bounce,
                 label="mirror bounces",
                 # Derivatives are propagated backwards through as many, whose state is stored
-                max_iterations=self.max_depth if data.differentiated else None,
+                max_iterations=self.max_depth if data.facts.differentiated else None,
             )
         return Trace(state["radiance"], direct, hit, state["bounces"], state["shadow_rays"])
 

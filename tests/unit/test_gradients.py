@@ -114,8 +114,15 @@ slopes("ball.to_world", 1e-2, {})
 slopes("ball.bsdf.int_ior", 4e-3, material(fresnel="dielectric"))
 slopes("ball.bsdf.f0.value", 4e-3, material(f0=rgb(0.5, 0.4, 0.3)))
 slopes("ball.bsdf.alpha.color0.value", 4e-3, material(alpha=TEXTURE))
-# FIXME *exact_shape("mrt_cone", "apex", "base_center", 2.0)
-# FIXME *exact_shape("mrt_cylinder", "p0", "p1", 1.0)
+for case in (
+    *exact_shape("mrt_cone", "apex", "base_center", 2.0),
+    *exact_shape("mrt_cylinder", "p0", "p1", 1.0),
+):
+    slopes(*case)
+# More lights than a kernel has code of their own for, without derivatives
+MANY = {f"light{i}": {"type": "mrt_light", "position": [i, 2, 5], "intensity": 0.05} for i in range(8)}
+slopes("light3.intensity.value", 2e-2, MANY)
+slopes("ball.bsdf.diffuse_reflectance.value", 2e-2, MANY)
 
 
 @pytest.mark.parametrize(("key", "step", "more"), slopes)
