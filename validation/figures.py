@@ -16,63 +16,67 @@ from mrt_mitsuba.validation.studies import error_vs_time, needs
 from mrt_mitsuba.validation.studies.stability import curves
 from mrt_mitsuba.validation.tools import diagrams
 from mrt_mitsuba.validation.tools.originals import read_original
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import Study, findings
+from mrt_mitsuba.validation.tools.work_precision import Findings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Rows = list[dict[str, Any]]
-Drawn = tuple["Figure", Rows]  # and the rows of its table
+Drawn = tuple[list["Figure"], Rows]  # and the rows of its table
 
 SMALL = (160, 120)
 
 
-def error_against_time(scene: error_vs_time.Number) -> Drawn:
-    """Return the diagram of all that a user can choose in a scene, and what to use to get to an error."""
-    panels = error_vs_time.choices(scene)
-    return diagrams.work_precision(panels), error_vs_time.advice(panels)
+def error_against_time(*scenes: error_vs_time.Number, quick: bool = False) -> Drawn:
+    """Diagrams of all that a user can choose in scenes, and what to use to get to an error."""
+    panels: dict[str, Findings] = {}
+    for scene in scenes:
+        cost = error_vs_time.QUICK if quick else error_vs_time.shown(scene)
+        panels |= error_vs_time.choices(scene, cost)
+    drawn = [diagrams.work_precision(title, found) for title, found in panels.items()]
+    return drawn, error_vs_time.advice(panels)
 
 
-def hard_axes(places: int = 21) -> Drawn:
-    """Return errors in roundings of float32 along the axes that are hard on it, and where lines break."""
-    return _of_study("roundings", lambda study: curves.show(study, quick=True, places=places))
+def hard_axes(*, quick: bool = False) -> Drawn:
+    """Errors in roundings of float32 along the axes that are hard on it, and where lines break."""
+    return _of_study("roundings", findings(curves.show, quick=True, places=3 if quick else 21))
 
 
-def left_out() -> Drawn:
-    """Return what the numbered scenes would cost if nothing were left out, and what each goes without."""
-    return _of_study("savings", lambda study: needs.show(study, SMALL, needs.SCENES, 3))
+def left_out(*, quick: bool = False) -> Drawn:
+    """What the numbered scenes would cost if nothing were left out, and what each goes without."""
+    scenes, repeats = ((3,), 1) if quick else (needs.SCENES, 5)
+    return _of_study("savings", findings(needs.show, size=SMALL, scenes=scenes, repeats=repeats))
 
 
-def _of_study(name: str, fill: Any) -> Drawn:
-    study = Study("", "")
-    fill(study)
+def _of_study(name: str, study: Study) -> Drawn:
     table = study.tables[name]
     rows = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
-    return study.images[name]["content"], rows
+    return [image["content"] for image in study.images.values()], rows
 
 
 def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
-    """Return scenes 0 to 4 by the original program and by ours, with their difference times 100.
+    """Scenes 0 to 4 by the original program and by ours, with their difference times 100.
 
     ``folder``: of the pictures ``sN_none_aa4.exr``, whole or shortened.
     """
-    drawn, plots = diagrams.figure(3, 5, 14, 6.7)
+    drawn, plots = diagrams.figure(5, 3, 7.2, 9.4)
     rows: Rows = []
-    for scene, column in enumerate(plots.T):
+    for scene, row in enumerate(plots):
         original = read_original(Path(folder) / f"s{scene}_none_aa4.exr")
         result = mrt.render(original.scene, fresnel="dielectric", **original.options)
         ours = original.like(result.image)
         difference = np.abs(ours - original.image)
-        for axes, picture in zip(column, (original.image, ours, 100 * difference), strict=True):
+        for axes, picture in zip(row, (original.image, ours, 100 * difference), strict=True):
             show_picture(axes, picture)
-        column[0].set_title(f"scene {scene}", loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
+        row[0].set_ylabel(f"scene {scene}", **diagrams.WORDS)
         off = (difference.max(axis=-1) > 1 / 255).mean()
         rows.append(
             {"scene": scene, "mean difference": float(difference.mean()), "off by > 1/255": float(off)}
         )
-    for axes, title in zip(plots[:, 0], ("original", "ours", "|difference| × 100"), strict=True):
-        axes.set_ylabel(title, fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
-    return drawn, rows
+    for axes, title in zip(plots[0], ("original", "ours", "|difference| × 100"), strict=True):
+        axes.set_title(title, loc="left", **diagrams.WORDS)
+    return [drawn], rows
 
 
 def show_picture(axes: Any, picture: np.ndarray) -> None:
@@ -83,7 +87,7 @@ def show_picture(axes: Any, picture: np.ndarray) -> None:
 
 
 def maps(result: mrt.Result) -> Figure:
-    """Return the picture of a render in rounds, its stated error and its rays, pixel by pixel."""
+    """The picture of a render in rounds, its stated error and its rays, pixel by pixel."""
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import LogLocator
     from PIL import Image
@@ -110,7 +114,7 @@ def maps(result: mrt.Result) -> Figure:
 
 
 def tenths(scene: Any, *, seeds: int, truth_spp: int, **options: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stated and the true error of tenths of the pixels [10], sorted by the stated one.
+    """The stated and the true error of tenths of the pixels [10], sorted by the stated one.
 
     ``options``: of renders in rounds, one for each seed. The noise of the truth is taken off its squares.
     """
@@ -136,7 +140,7 @@ def tenths(scene: Any, *, seeds: int, truth_spp: int, **options: Any) -> tuple[n
 def stated_and_true(
     scenes: Mapping[str, Any], *, seeds: int = 8, truth_spp: int = 2048, **options: Any
 ) -> Figure:
-    """Return a plot of the true over the stated error of tenths of the pixels, a line for each scene.
+    """A plot of the true over the stated error of tenths of the pixels, a line for each scene.
 
     ``scenes``: loaded ones by name; ``options``: by default a mean of 64 rays of ``path`` where needed.
     """

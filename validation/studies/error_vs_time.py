@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mitsuba as mi
@@ -69,19 +69,27 @@ FULL = Cost(
     sampler_counts=(4, 16, 64),
 )
 DOCS = Cost(
-    size=(120, 90),
-    path_size=(120, 90),
+    size=(400, 300),
+    path_size=(160, 120),
     amounts=(1, 2, 4, 8),
-    most=32,
+    most=16,
     counts=(),
-    path_spp=256,
+    path_spp=1024,
     repeats=3,
     rounds=(16,),
-    targets=("2%",),
+    targets=("8%", "4%"),
     samplers=SAMPLERS,
     lattices=("centered",),
     cold=False,
 )
+# Widths of scenes in the documentation, at which four rays in each pixel take some 50 ms
+WIDTHS: dict[Number, int] = {0: 720, 1: 640, 2: 560, 3: 480, 4: 400}
+
+
+def shown(scene: Number) -> Cost:
+    """What the documentation measures in a scene."""
+    width = WIDTHS.get(scene, DOCS.size[0])
+    return replace(DOCS, size=(width, width * 3 // 4))
 
 
 @dataclass(frozen=True)
@@ -191,7 +199,7 @@ def _with_sampler(nodes: Options, sampler: str) -> Options:
 def _rounds(cost: Cost, **options: Any) -> dict[str, Options]:
     """Renders whose rays go to noise, so many of them or to an error."""
     own = {"aa": None, "lattice": None, **options}
-    most = 2 * max(cost.rounds, default=1)
+    most = 4 * max(cost.rounds, default=1)
     cases = {f"aamode=noise spp={spp}": {**own, "aamode": "noise", "spp": spp} for spp in cost.rounds}
     aims = {f"target={aim}": {**own, "aamode": None, "target": aim, "maxspp": most} for aim in cost.targets}
     return cases | aims

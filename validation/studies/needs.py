@@ -33,6 +33,13 @@ EVERYTHING = "all code, layers and rays"
 # What is compared of each measure: where every pixel gets all rays, there is one pass instead of two
 MEASURES = {"rays": EVERYTHING, "operations": EVERYTHING, "launches": GENERAL, "seconds": EVERYTHING}
 
+TITLES = {
+    "rays": "rays",
+    "operations": "size of the tracing kernel, operations",
+    "launches": "launches of kernels",
+    "seconds": "time",
+}
+
 REFINED: dict[str, Any] = {"aa": 4, "aamode": "sobel", "lattice": "report"}
 
 Figures = dict[str, dict[str, float]]  # of ``MEASURES``, by the way
@@ -115,10 +122,11 @@ def show(study: Study, size: tuple[int, int], scenes: Sequence[int], repeats: in
             times_as_many = found[number][MEASURES[name]][name] / planned[name]
             study.at_least(f"scene {number}: {name} without a plan / with it", times_as_many, 1, why)
     caption = (
-        "Blue: as planned, with the figure itself next to it. Orange: where nothing is left out: all code in "
+        "Blue: as planned, with the figure itself on it. Orange: where nothing is left out: all code in "
         "the kernels, all layers, and (but for launches) as many rays in every pixel as edges get."
     )
-    study.picture("savings", "As planned, and with nothing left out", savings(found), caption)
+    for name, title in TITLES.items():
+        study.picture(f"savings {name}", title, savings(name, found), caption if name == "rays" else "")
     columns = "{}x{} pixels; operations: of the largest kernel, in Dr.Jit's own code".format(*size)
     study.records("savings", "What each scene goes without", rows, columns, first=True)
 
@@ -127,35 +135,25 @@ def _left_out(result: Result) -> str:
     return ", ".join(what for what, _ in result.plan.left_out if what not in LAYERS)
 
 
-def savings(found: Mapping[int, Mapping[str, Mapping[str, float]]]) -> Figure:
-    """Draw how many times as much scenes cost where nothing is left out: a row for each, a plot a measure."""
-    drawn, plots = diagrams.figure(1, len(MEASURES), 14, 0.42 * len(found) + 1.3)
-    titles = ("rays", "size of the tracing kernel", "launches of kernels", "time")
+def savings(name: str, found: Mapping[int, Figures]) -> Figure:
+    """Draw how many times as much of a measure scenes cost where nothing is left out, a bar for each."""
+    planned = np.array([figures[PLANNED][name] for figures in found.values()])
+    times = np.array([figures[MEASURES[name]][name] for figures in found.values()]) / planned
+    most = max(times.max(), 1.2)
     rows = np.arange(len(found))
-    for axes, (name, way), title in zip(plots[0], MEASURES.items(), titles, strict=True):
-        planned = np.array([figures[PLANNED][name] for figures in found.values()])
-        times = np.array([figures[way][name] for figures in found.values()]) / planned
-        axes.barh(rows, times, height=0.7, color="#f2b98f")
-        axes.barh(rows, np.ones(len(rows)), height=0.7, color=diagrams.COLORS[0])
-        most = max(times.max(), 1.2)
-        shown = {"va": "center", "fontsize": diagrams.LABELS, "color": diagrams.TEXT}
-        for row, (own, factor) in enumerate(zip(planned, times, strict=True)):
-            axes.text(max(factor, 1) + 0.02 * most, row, f"×{factor:.2g}", **shown)
-            axes.text(-0.02 * most, row, _quantity(own, name), **shown | {"ha": "right"})
-        axes.set_title(title, loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
-        axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, 1.15 * most), yticks=[])
-        axes.set_xlabel("times as much as planned")
-        axes.spines["left"].set_visible(False)
-        axes.axvline(1, color=diagrams.TEXT, linewidth=0.6)
-    for row, number in enumerate(found):
-        place: dict[str, Any] = {
-            "transform": plots[0, 0].get_yaxis_transform(),
-            "va": "center",
-            "ha": "right",
-        }
-        plots[0, 0].text(
-            -0.32, row, f"scene {number}", color=diagrams.TEXT, fontsize=diagrams.LABELS + 1, **place
-        )
+    drawn, axes = diagrams.panel(TITLES[name], 4.6, 0.3 * len(found) + 1)
+    axes.barh(rows, times, height=0.7, color="#f2b98f")
+    axes.barh(rows, np.ones(len(rows)), height=0.7, color=diagrams.COLORS[0])
+    shown: dict[str, Any] = {"va": "center", "fontsize": diagrams.LABELS}
+    for row, (own, factor) in enumerate(zip(planned, times, strict=True)):
+        axes.text(max(factor, 1) + 0.02 * most, row, f"× {factor:.2f}", color=diagrams.TEXT, **shown)
+        axes.text(0.02 * most, row, _quantity(own, name), color="white", **shown)
+    axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, 1.25 * most))
+    axes.set_yticks(rows, [f"scene {number}" for number in found])
+    axes.tick_params(axis="y", length=0)
+    axes.set_xlabel("times as much as planned", **diagrams.WORDS)
+    axes.spines["left"].set_visible(False)
+    axes.axvline(1, color=diagrams.TEXT, linewidth=0.6)
     return drawn
 
 

@@ -21,6 +21,7 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#aa4499", "#56b4e9", "#e69f00", "#6a
 GREY = "#8a8f98"
 TEXT = "#30343b"
 LABELS = 9.0  # points, of labels at lines
+WORDS: dict[str, Any] = {"fontsize": LABELS, "color": TEXT}  # at axes
 MARKERS = "osD^vPXh"
 
 
@@ -36,6 +37,13 @@ def figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure
         axes.spines[["left", "bottom"]].set_color(GREY)
         axes.tick_params(colors=TEXT, labelsize=LABELS)
     return drawn, plots
+
+
+def panel(title: str, width: float = 5.0, height: float = 4.4) -> tuple[Figure, Axes]:
+    """Return a figure of one plot with a title, of a size in inches that a phone shows whole."""
+    drawn, plots = figure(1, 1, width, height)
+    plots[0, 0].set_title(title, loc="left", fontsize=LABELS + 1, color=TEXT)
+    return drawn, plots[0, 0]
 
 
 def plain_numbers(scale: Any) -> None:
@@ -98,20 +106,18 @@ def apart(places: Sequence[float], gap: float) -> list[float]:
 # --------------------------------------- Error against time ---------------------------------------
 
 
-def work_precision(panels: Mapping[str, Findings]) -> Figure:
-    """Draw the error of each case over its seconds, a panel for each title; down and to the left is better.
+def work_precision(title: str, found: Findings) -> Figure:
+    """Draw the error of each case over its seconds; down and to the left is better.
 
     Curves that are the best at some error are coloured, with what distinguishes their points; the others are
     grey. Bars are intervals, the band at the bottom is the reference's own error.
     """
-    drawn, plots = figure(1, len(panels), 6.2 * len(panels) + 0.6, 5.4)
-    for axes, (title, found) in zip(plots[0], panels.items(), strict=True):
-        axes.set(xscale="log", yscale="log", xlabel="seconds of a warm render")
-        axes.set_title(title, loc="left", fontsize=LABELS + 2, color=TEXT)
-        _draw_curves(axes, found)
-    plots[0, 0].set_ylabel("error (RMSE, linear)")
-    for axes, found in zip(plots[0], panels.values(), strict=True):
-        label_ends(axes, _ends(found))
+    drawn, axes = panel(title)
+    axes.set(xscale="log", yscale="log")
+    axes.set_xlabel("seconds of a warm render", **WORDS)
+    axes.set_ylabel("error (RMSE, linear)", **WORDS)
+    _draw_curves(axes, found)
+    label_ends(axes, _ends(found))
     return drawn
 
 
@@ -122,10 +128,9 @@ def frontier(points: Sequence[Point]) -> list[Point]:
     """
     best: list[Point] = []
     for point in sorted(points, key=lambda point: (point.seconds, point.rmse)):
-        claimed = point.resolved or not point.reference_error
-        if claimed and (not best or point.rmse < best[-1].rmse):
+        if not best or point.rmse < best[-1].rmse:
             best.append(point)
-    return best
+    return [point for point in best if point.resolved or not point.reference_error]
 
 
 def _shown_error(point: Point, bottom: float) -> float:

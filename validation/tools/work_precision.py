@@ -404,7 +404,7 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
         f"{own if found.reference_error else 'not known'}. "
     )
     caption += " ".join(found.verdicts)
-    drawn = diagrams.work_precision({title: found})
+    drawn = diagrams.work_precision(title, found)
     study.picture(f"{prefix}diagram", f"{title}: work and precision", drawn, caption)
     if found.errors:
         study.records(f"{prefix}advice", f"{title}: what to use", found.advice(), first=not name)

@@ -84,38 +84,40 @@ def show(study: Study, *, quick: bool, places: int = 0) -> None:
         }
         rows.append(row)
     caption = (
-        "Blue: ours. Orange: what of Mitsuba's comes nearest. Grey, dashed: the formula as one would write "
-        "it first, in float32. Dotted: what is promised of ours. At the top no digit is right any more."
+        "Roundings of float32 (6e-8). Blue: ours. Orange: what of Mitsuba's comes nearest. Grey, dashed: the "
+        "formula as one would write it first. Dotted: what is promised of ours."
     )
-    study.picture("roundings", "Error in roundings of float32 (6e-8), log scales", roundings(lines), caption)
+    for number, axis in enumerate(AXES):
+        title = f"{axis.title} along the {axis.label}"
+        plot = roundings(axis, *lines[axis])
+        study.picture(f"roundings {number}", title, plot, "" if number else caption)
     note = f"One rounding is 2⁻²⁴. {WORST:.0%} of the samples of a place stay below its figure."
     study.records("roundings", "Where it breaks, and where ours does not", rows, note, first=True)
 
 
-def roundings(curves: Mapping[Axis, tuple[Array, Curves]]) -> Figure:
-    """Draw errors in roundings of float32 along axes: a small plot for each, all with the same scale."""
+def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
+    """Draw errors in roundings of float32 along an axis; all axes have the same scale."""
     looks: dict[str, dict[str, Any]] = {
         FIRST: {"color": diagrams.GREY, "linestyle": (0, (4, 2)), "linewidth": 1.4},
         THEIRS: {"color": diagrams.COLORS[1], "linewidth": 1.4},
         OURS: {"color": diagrams.COLORS[0], "linewidth": 2.4},
     }
-    drawn, plots = diagrams.figure(2, 4, 14, 6.6)
-    for axes, (axis, (x, lines)) in zip(plots.flat, curves.items(), strict=True):
-        axes.axhspan(0.1, axis.limit, color="#dcebf7", zorder=0)
-        axes.axhline(axis.limit, color=diagrams.COLORS[0], linestyle=":", linewidth=1)
-        for name, look in looks.items():
-            axes.plot(x, lines[name], **look)
-        axes.set(xscale="log", yscale="log", ylim=(0.2, 10 * NONE_RIGHT), xlabel=axis.label)
-        axes.set_title(axis.title, loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
-        axes.grid(alpha=0.2)
-    for axes in plots[:, 0]:
-        axes.set_ylabel("error in roundings of float32")
-        words = {"color": diagrams.GREY, "fontsize": diagrams.LABELS - 1, "va": "bottom", "ha": "right"}
-        axes.text(0.98, NONE_RIGHT, "no digit is right", transform=axes.get_yaxis_transform(), **words)
-    for axes, (axis, (x, lines)) in zip(plots.flat, curves.items(), strict=True):
-        names = {THEIRS: axis.nearest}
-        marks = {names.get(n, n): (x[-1], lines[n][-1], looks[n]["color"]) for n in looks}
-        diagrams.label_ends(axes, marks | {"promised": (x[-1], axis.limit, diagrams.COLORS[0])})
+    drawn, axes = diagrams.panel(axis.title, 4.6, 3.2)
+    axes.axhspan(0.1, axis.limit, color="#dcebf7", zorder=0)
+    axes.axhline(axis.limit, color=diagrams.COLORS[0], linestyle=":", linewidth=1)
+    for name, look in looks.items():
+        axes.plot(x, lines[name], **look)
+    axes.set(xscale="log", yscale="log", ylim=(0.2, 10 * NONE_RIGHT))
+    axes.set_xlabel(axis.label, **diagrams.WORDS)
+    axes.set_ylabel("error in roundings", **diagrams.WORDS)
+    axes.grid(alpha=0.2)
+    place: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "bottom", "ha": "center"}
+    axes.text(
+        0.5, 1.3 * NONE_RIGHT, "no digit is right", color=diagrams.GREY, fontsize=diagrams.LABELS, **place
+    )
+    labels = {FIRST: FIRST, THEIRS: axis.nearest, OURS: OURS}
+    ends = {label: (x[-1], lines[name][-1], looks[name]["color"]) for name, label in labels.items()}
+    diagrams.label_ends(axes, ends | {"promised": (x[-1], axis.limit, diagrams.COLORS[0])})
     return drawn
 
 
