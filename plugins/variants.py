@@ -75,6 +75,14 @@ def largest(texture: mi.Texture) -> float:
     return max(abs(first(channel)) for channel in value)
 
 
+def text_of(thing: object) -> str:
+    """Return what an object says of itself; the name of its class where that, in Python, says nothing."""
+    try:
+        return str(thing)
+    except RuntimeError:  # its to_string, or that of something inside it, is missing
+        return type(thing).__name__
+
+
 def construct_quietly(integrator: mi.SamplingIntegrator, props: mi.Properties) -> None:
     """Construct the base class without Mitsuba's warning about scalar variants; ``mrt.render`` gives one."""
     level = mi.log_level()

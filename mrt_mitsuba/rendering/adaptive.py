@@ -13,7 +13,7 @@ import numpy as np
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import TARGET, check
 from mrt_mitsuba.plugins.parameters import ParameterError, integer, number
-from mrt_mitsuba.plugins.variants import construct_quietly
+from mrt_mitsuba.plugins.variants import construct_quietly, text_of
 from mrt_mitsuba.rendering.settings import MAX_SPP
 from mrt_mitsuba.target import Goal, StatesGoal, Target
 
@@ -27,8 +27,9 @@ class MrtAdaptive(mi.SamplingIntegrator):
 
     It does what ``mrt.render`` does with ``target``, where there is only ``mi.render`` or an XML file. The
     scene's film is filled by its own rules, and holds the channels of the nested integrator, then
-    ``error.Y``, the standard error of each pixel, and ``samples.Y``, its rays; a ``specfilm`` holds its bands
-    only. Derivatives are those of the nested integrator, at the ``spp`` that ``mi.render`` is given.
+    ``error.Y``, the standard error of each pixel, and ``samples.Y``, its rays, unless that has such names
+    itself; a ``specfilm`` holds its bands only. Derivatives are those of the nested integrator, at the
+    ``spp`` that ``mi.render`` is given.
 
     ================ =========== ======== ================================================================
     name             type        default  unit or range
@@ -102,7 +103,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
             source = replace(opened("a Mitsuba scene", scene, view, self.nested), goal=self.bounded(spp))
             result = render_source(source, settings, job)
             film, layers = view.film(), result.layers
-            names = self.aov_names() if _further(film) else []
+            names = [] if _has_bands_only(film) else self.aov_names()
             colors = [layers[name] for name in result.plan.bands] or list(np.moveaxis(result.image, -1, 0))
             alpha = [layers["A"]] if "A" in layers else []
             planes = [*colors, *alpha, np.ones_like(result.image[..., 0]), *(layers[name] for name in names)]
@@ -117,21 +118,29 @@ class MrtAdaptive(mi.SamplingIntegrator):
         )
 
     def aov_names(self) -> list[str]:
-        return [*self.nested.aov_names(), "error.Y", "samples.Y"]
+        return [*self.nested.aov_names(), *self._own_names()]
+
+    def _own_names(self) -> list[str]:
+        """The channels next to those of the nested integrator, whose names come first."""
+        return [name for name in ("error.Y", "samples.Y") if name not in self.nested.aov_names()]
+
+    def _further(self, film: mi.Film) -> int:
+        """Number of channels that a film takes up next to those of the nested integrator."""
+        return 0 if _has_bands_only(film) else len(self._own_names())
 
     def _seen(self, picture: mi.TensorXf) -> mi.TensorXf:
         """Return the channels that ``mi.render`` shows of the nested integrator, and those of this one."""
         if self.nested.class_name() != "AOVIntegrator" or "A" not in (n[-1] for n in self.aov_names()[3:4]):
             return picture
         # the picture of its first integrator is the colours once more, and Mitsuba leaves it out
-        further = len(self.aov_names())
-        return dr.concat([picture[..., :-further], picture[..., 4 - further :]], axis=2)
+        first = picture.shape[2] - len(self.aov_names())
+        return mi.TensorXf(np.delete(np.array(picture), np.s_[first : first + 4], axis=2))
 
     def render_forward(
         self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: int = 0, spp: int = 0
     ) -> mi.TensorXf:
         found = self.nested.render_forward(scene, params, sensor, seed, spp)
-        further = _further(_sensor(scene, sensor).film())
+        further = self._further(_sensor(scene, sensor).film())
         return dr.concat([found, dr.zeros(mi.TensorXf, (*found.shape[:2], further))], axis=2)
 
     def render_backward(
@@ -143,7 +152,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         seed: int = 0,
         spp: int = 0,
     ) -> None:
-        kept = grad_in.shape[2] - _further(_sensor(scene, sensor).film())
+        kept = grad_in.shape[2] - self._further(_sensor(scene, sensor).film())
         self.nested.render_backward(scene, params, grad_in[..., :kept], sensor, seed, spp)
 
     def traverse(self, callback: Any) -> None:
@@ -152,7 +161,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
     def to_string(self) -> str:
         target, most = self.goal.target, self.goal.most
         goal = f"spp={most}" if target is None else f"target={target}, max_spp={most}"
-        return f"MrtAdaptive[{goal}, max_seconds={self.goal.seconds or 0:g}, nested={self.nested}]"
+        return f"MrtAdaptive[{goal}, max_seconds={self.goal.seconds or 0:g}, nested={text_of(self.nested)}]"
 
 
 def _goal(props: mi.Properties) -> Goal:
@@ -183,9 +192,8 @@ def _sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
     return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
 
 
-def _further(film: mi.Film) -> int:
-    """Return the number of channels that a film takes up besides those of the nested integrator."""
-    return 0 if mi.has_flag(film.flags(), mi.FilmFlags.Special) else 2  # specfilm has its bands only
+def _has_bands_only(film: mi.Film) -> bool:
+    return mi.has_flag(film.flags(), mi.FilmFlags.Special)  # specfilm
 
 
 mi.register_integrator(MrtAdaptive.plugin_name, MrtAdaptive)

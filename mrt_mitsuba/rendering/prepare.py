@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
+from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.plugins.snapshot import Part
 from mrt_mitsuba.rendering.api import Result, open_with, render_source, session
@@ -21,8 +22,8 @@ from mrt_mitsuba.rendering.shading import camera_matrices
 class Prepared:
     """A scene ready to be rendered: ``again(seed=…)`` is to the bit what ``mrt.render`` returns of it.
 
-    ``params``: its parameters by keys of ``mi.traverse``; what is set there is seen by the next picture. What
-    shapes the code of the kernels is fixed; a change of that, such as the first mirror, makes them anew.
+    ``params``: its parameters by keys of ``mi.traverse``; what is set there is seen by the next picture, also
+    another size of the film. A change of what shapes the kernels, such as the first mirror, makes them anew.
     """
 
     _source: Any = None  # the open scene
@@ -34,6 +35,7 @@ class Prepared:
         self._scene, self._settings = scene, RenderSettings.of(**options)
         with runtime.one_at_a_time, held():
             self._render(self._settings.seed)
+            self._film_window = _window(self._source.sensor.film())
             self.params = mi.traverse(self._source.scene)
             self._record()
 
@@ -42,6 +44,7 @@ class Prepared:
         with runtime.one_at_a_time, held():
             runtime.use(self._made.plan.variant)
             self.params.update()
+            self._resize()
             if self._launch is None:
                 return self._render(seed)
             plan, self._data = self._data.plan, self._source.integrator.prepare(self._source.scene)
@@ -52,6 +55,19 @@ class Prepared:
             plan = replace(self._made.plan, parts=self._data.facts)
             options = {**self._made.options, "seed": seed}
             return replace(self._made, image=self._picture(seed), plan=plan, options=options)
+
+    def _resize(self) -> None:
+        """Take up a new size of the film; raise ``UsageError`` where the options state another."""
+        window = _window(self._source.sensor.film())
+        if window == self._film_window:
+            return
+        if self._settings.width or self._settings.height:
+            raise UsageError(
+                "the film has another size or crop window than before, but width or height was given to "
+                "prepare: leave them out there, or call prepare with others"
+            )
+        self._source = replace(self._source, width=window[2], height=window[3])
+        self._film_window = window
 
     def _render(self, seed: int) -> Result:
         """Render from scratch; later results differ from this one by the picture."""
@@ -124,6 +140,11 @@ class Prepared:
         ray, weight = self._sensor.sample_ray(time, mi.Float(0), place / self._size, mi.Point2f(0.5))
         traced = self._source.integrator.trace(self._source.scene, None, mi.Ray3f(ray), True, self._data)
         return list(mi.Color3f(traced.radiance * mi.unpolarized_spectrum(weight)))
+
+
+def _window(film: mi.Film) -> tuple[int, ...]:
+    """Size, size of the crop window and its offset, in pixels."""
+    return tuple(int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
 
 
 def prepare(scene: Any = 0, **options: Any) -> Prepared:

@@ -15,7 +15,7 @@ from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.plugins import plugin
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.plugins.parameters import ParameterError
-from mrt_mitsuba.plugins.variants import ByShape
+from mrt_mitsuba.plugins.variants import ByShape, text_of
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.scene.open import Source
 
@@ -132,7 +132,7 @@ class Shader:
             self.layers |= integrator.provided_layers
         elif self._derivatives:
             self.name = type(integrator).__name__
-        elif not isinstance(integrator, mi.SamplingIntegrator) or "StokesIntegrator" in repr(integrator):
+        elif not isinstance(integrator, mi.SamplingIntegrator) or "StokesIntegrator" in text_of(integrator):
             # Mitsuba would crash in a sample of stokes, also inside another
             self.layers = frozenset()
         self.aovs = tuple(integrator.aov_names())  #: names of the integrator's own channels

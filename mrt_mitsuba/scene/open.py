@@ -15,6 +15,7 @@ import mitsuba as mi
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import is_obj
+from mrt_mitsuba.plugins.variants import text_of
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene
 from mrt_mitsuba.scene.report import report_scene
@@ -227,6 +228,6 @@ def _integrator(integrator: Any, scene: mi.Scene) -> mi.Integrator:
     _check_variant("integrator", integrator)
     if not isinstance(integrator, mi.Integrator):
         raise UsageError(
-            f"the integrator is {' '.join(repr(integrator).split())}: it must be one, such as path"
+            f"the integrator is {' '.join(text_of(integrator).split())}: it must be one, such as path"
         )
     return integrator

@@ -141,3 +141,40 @@ def test_lists_around_the_eye_follow_the_camera():
         parameters.update()
     assert_allclose(*slopes, rtol=1e-5)
     assert slopes[0].all()
+
+
+SIZES = {
+    "size": {"film.size": [20, 10]},
+    "crop window": {"film.crop_size": [8, 6], "film.crop_offset": [2, 3]},
+}
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+@pytest.mark.parametrize("options", [{"aa": 1, "aamode": "none"}, {}, {"spp": 2}], ids=str)
+@pytest.mark.parametrize("change", SIZES)
+def test_a_prepared_scene_follows_the_size_of_its_film(variant, options, change):
+    nodes = {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}}
+    scene = mi.load_dict(nodes | {"eye": sensor([0, 1, 6], [0, 0, 0], (16, 12), fov=25)})
+    again = mrt.prepare(scene, **options)
+    before = again()
+    for name, value in SIZES[change].items():
+        again.params[f"eye.{name}"] = value
+    after = again()
+    expected = mrt.render(scene, **options)
+    assert after.image.shape == expected.image.shape != before.image.shape
+    assert (after.plan.width, after.plan.height) == (expected.plan.width, expected.plan.height)
+    assert_array_equal(after.image, expected.image)
+    assert_array_equal(again(seed=3).image, mrt.render(scene, seed=3, **options).image)
+
+
+def test_a_size_of_the_film_and_one_by_option_contradict_each_other(variant):
+    scene = mi.load_dict(mrt.scene_dict(3))
+    again = mrt.prepare(scene, width=16, height=12, aa=1, aamode="none")
+    before = again().image
+    key = next(key for key in again.params.keys() if key.endswith("film.size"))  # noqa: SIM118
+    size = list(again.params[key])
+    again.params[key] = [20, 10]
+    with pytest.raises(mrt.UsageError, match="width or height was given to prepare"):
+        again()
+    again.params[key] = size
+    assert_array_equal(again().image, before)

@@ -1,0 +1,108 @@
+"""Channels and integrators of the user's own, by any name, or by none: every door gives them back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from nodes import sensor
+from numpy.testing import assert_allclose
+
+import mrt_mitsuba as mrt
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def scene(integrator: dict[str, Any]) -> mi.Scene:
+    nodes: dict[str, Any] = {"type": "scene", "integrator": integrator, "sky": {"type": "constant"}}
+    nodes["ball"] = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 0.4}}
+    return mi.load_dict(nodes | {"sensor": sensor([0, 1, 6], [0, 0, 0], (8, 6), fov=25)})
+
+
+def of_the_user(names: str) -> dict[str, Any]:
+    """An integrator as in tutorials, whose channels hold 1, 2, ...; like most, it has no ``to_string``."""
+
+    class Named(mi.SamplingIntegrator):  # of the current variant
+        def __init__(self, props: mi.Properties) -> None:
+            mi.SamplingIntegrator.__init__(self, props)
+            self.names = props["names"].split()
+
+        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> tuple:
+            values = [mi.Float(1 + k) for k in range(len(self.names))]
+            return mi.Spectrum(0.25), mi.Bool(True), values
+
+        def aov_names(self) -> list[str]:
+            return self.names
+
+    mi.register_integrator("named", Named)
+    return {"type": "named", "names": names}
+
+
+NAMES = [
+    "square.Y",
+    "square image",
+    "image.R image.G image.B",
+    "error.Y samples.Y",
+    "variance.R depth.Z noise",
+]
+OPTIONS: list[dict[str, Any]] = [{"spp": 4}, {"layers": "all"}, {"target": 0.1, "maxspp": 16}]
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+@pytest.mark.parametrize("names", NAMES)
+def test_names_of_the_user_win(names, options):
+    result = mrt.render(scene(of_the_user(names)), **options)
+    assert_allclose(result.image, 0.25, rtol=1e-5)
+    for k, name in enumerate(names.split()):
+        assert_allclose(result.layers[name], 1 + k, rtol=1e-5)
+
+
+@pytest.mark.parametrize("names", NAMES)
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+def test_names_of_the_user_win_inside_mrt_adaptive(variant, names):
+    inside = {"type": "mrt_adaptive", "target": 0.1, "max_spp": 16, "nested": of_the_user(names)}
+    loaded = scene(inside)
+    picture = np.array(mi.render(loaded))
+    count = len(names.split())
+    assert_allclose(
+        picture[..., 3 : 3 + count], np.ones((*picture.shape[:2], 1)) * range(1, 1 + count), rtol=1e-5
+    )
+    own = {"error.Y", "samples.Y"} - set(names.split())
+    assert picture.shape[2] == 3 + count + len(own)
+    assert "Named" in str(loaded.integrator())
+
+
+@pytest.mark.parametrize("name", ["variance", "error", "samples", "image", "albedo"])
+@pytest.mark.parametrize("options", [{}, *OPTIONS], ids=str)
+def test_channels_of_aov_keep_their_values(name, options):
+    """The variance of the noise came back as the albedo."""
+    inner = {"type": "aov", "aovs": f"{name}:albedo", "inner": {"type": "path"}}
+    layers = mrt.render(scene(inner), **options).layers
+    albedo = np.stack([layers[f"{name}.{letter}"] for letter in "RGB"], -1)
+    assert albedo.max() == pytest.approx(0.4, abs=1e-5)
+    assert albedo.min() == pytest.approx(0, abs=1e-5)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb", "scalar_spectral"], indirect=True)
+@pytest.mark.parametrize("name", ["error", "samples", "d"])
+def test_mrt_adaptive_around_aov(variant, name):
+    """``error:position`` has an ``error.Y`` of its own; in scalar variants, any was a TypeError."""
+    inner = {"type": "aov", "aovs": f"{name}:position", "inner": {"type": "path"}}
+    inside = {"type": "mrt_adaptive", "target": 0.1, "max_spp": 16, "nested": inner}
+    picture = np.array(mi.render(scene(inside)))
+    assert picture.shape == (6, 8, 3 + 3 + (2 if name == "d" else 1))
+    assert picture[..., 3:6].max() == pytest.approx(1, abs=0.2)  # of a ball of radius one
+
+
+@pytest.mark.parametrize("door", ["mi.render", "mrt.render", "prepare", "target"])
+def test_integrators_without_to_string(door):
+    loaded = scene(of_the_user("a"))
+    doors = {
+        "mi.render": lambda: np.array(mi.render(loaded))[..., :3],
+        "mrt.render": lambda: mrt.render(loaded).image,
+        "prepare": lambda: mrt.prepare(loaded)().image,
+        "target": lambda: mrt.render(loaded, target="2%").image,
+    }
+    assert_allclose(doors[door](), 0.25, rtol=1e-5)
