@@ -13,8 +13,6 @@ import mitsuba as mi
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from mrt_mitsuba.plugins.variants import text_of
-
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
 
@@ -132,7 +130,7 @@ class Film:
 
     def __init__(self, sensor: Any) -> None:
         film, sampler = sensor.film(), sensor.sampler()
-        rfilter, found = film.rfilter(), re.search(r"pixel_format = (\w+)", text_of(film))
+        rfilter, found = film.rfilter(), re.search(r"pixel_format = (\w+)", str(film))
         self.sensor = sensor
         #: pixels on either side to which a ray contributes
         self.reach = 0 if rfilter.is_box_filter() else int(rfilter.border_size())
