@@ -13,9 +13,9 @@ import os
 import stat
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cache, wraps
+from functools import cache, reduce, wraps
 from typing import Any
 
 import drjit as dr
@@ -61,6 +61,89 @@ class Turn:
 one_at_a_time = Turn()
 
 
+# ----------------------------------------------- The list ----------------------------------------------
+
+
+@dataclass(frozen=True)
+class Replacement:
+    """A function that was put in place of one of Mitsuba's."""
+
+    owner: Any
+    name: str
+    theirs: Function
+    ours: Function
+    inherited: bool  # had the owner the function from a base class
+
+    def undo(self) -> bool:
+        """Take the function back; False where somebody else has put something around it."""
+        alone = getattr(self.owner, self.name) is self.ours
+        if alone and self.inherited:
+            delattr(self.owner, self.name)
+        elif alone:
+            setattr(self.owner, self.name, self.theirs)
+        home = _home(self.owner, self.name, self.theirs)
+        if getattr(home, self.name) is self.ours:
+            setattr(home, self.name, self.theirs)
+        return alone
+
+
+@dataclass
+class Change:
+    """A function of Mitsuba's that is replaced."""
+
+    where: str  #: as users call it, such as "mi.render"
+    ours: Function  #: what is called in its place: with the function itself, then its arguments
+    what: str
+    why: str
+    since: str = "Mitsuba 3.9"  #: the first release that needs it, as far as is known
+    made: list[Replacement] = field(default_factory=list)  #: in the variants so far
+
+    def make(self) -> None:
+        """Put our function in place where it is not, in the current variant."""
+        _, *path, name = self.where.split(".")
+        owner = reduce(getattr, path, mi)
+        theirs = around = getattr(owner, name)
+        own = {id(each.ours) for each in self.made}
+        while around is not None:
+            if id(around) in own:
+                return
+            around = getattr(around, "__wrapped__", None)
+
+        @wraps(theirs)
+        def call(*args: object, **given: object) -> object:
+            return self.ours(theirs, *args, **given) if _in_effect else theirs(*args, **given)
+
+        with contextlib.suppress(ValueError, TypeError):  # functions in C++ have none
+            call.__signature__ = inspect.signature(theirs)  # type: ignore[attr-defined]
+        self.made.append(Replacement(owner, name, theirs, call, inherited=name not in vars(owner)))
+        for each in (owner, _home(owner, name, theirs)):
+            setattr(each, name, call)
+
+    def undo(self) -> None:
+        """Take our functions back; those inside of somebody else's only pass calls on."""
+        self.made = [each for each in self.made if not each.undo()]
+
+
+def _home(owner: Any, name: str, function: Function) -> Any:
+    """Return the module that a function of Mitsuba's is pickled by, or its owner."""
+    module = sys.modules.get(getattr(function, "__module__", None) or "")
+    return module if module is not None and inspect.ismodule(owner) and hasattr(module, name) else owner
+
+
+CHANGES: list[Change] = []
+_in_effect = _watching = False
+
+
+def change(where: str, *, what: str, why: str) -> Callable[[Function], Function]:
+    """Put a change into ``CHANGES``, by the function that is called in place of Mitsuba's."""
+
+    def add(ours: Function) -> Function:
+        CHANGES.append(Change(where, ours, what, why))
+        return ours
+
+    return add
+
+
 # ------------------------------------------- Rendering in turn -----------------------------------------
 
 
@@ -69,9 +152,8 @@ def is_ours(thing: object) -> bool:
     return type(thing).__module__.startswith("mrt_mitsuba.")
 
 
-def _needs_turn(scene: mi.Scene, integrator: mi.Integrator | None) -> bool:
+def needs_turn(scene: mi.Scene, integrator: mi.Integrator) -> bool:
     """Return whether a render runs Python code of ours, and none of somebody else's that may wait for it."""
-    integrator = integrator or scene.integrator()
     if is_ours(integrator):
         return True
     if not plugins.any_constructed() or not plugins.is_known(integrator):
@@ -83,49 +165,54 @@ def _needs_turn(scene: mi.Scene, integrator: mi.Integrator | None) -> bool:
     return any(map(is_ours, direct)) or any(map(is_ours, mi.traverse(scene).hierarchy))
 
 
-def _render_in_turn(render: Function) -> Function:
-    parameters = list(inspect.signature(render).parameters)
-
-    def call(*args: Any, **given: Any) -> Any:
-        named = dict(zip(parameters, args, strict=False)) | given
-        scene, integrator = named.get("scene"), named.get("integrator")
-        if not isinstance(scene, mi.Scene) or not _needs_turn(scene, integrator):
+@change(
+    "mi.render",
+    what="renders scenes with plugins of this project one after the other, and passes Ctrl-C on",
+    why="two threads that trace plugins in Python at once end the process; Dr.Jit turns a Ctrl-C in an "
+    "integrator in Python into a RuntimeError",
+)
+def render_in_turn(render: Function, /, *args: object, **given: object) -> object:
+    named = dict(zip(inspect.signature(render).parameters, args, strict=False)) | given
+    scene = named.get("scene")
+    if not isinstance(scene, mi.Scene):
+        return render(*args, **given)
+    if not needs_turn(scene, named.get("integrator") or scene.integrator()):
+        return render(*args, **given)
+    with one_at_a_time:
+        try:
             return render(*args, **given)
-        with one_at_a_time:
-            try:
-                return render(*args, **given)
-            except RuntimeError as error:
-                if interrupt := interrupt_behind(error):
-                    raise interrupt from None
-                raise
-
-    return call
+        except RuntimeError as error:
+            if interrupt := interrupt_behind(error):
+                raise interrupt from None
+            raise
 
 
-def _change_in_turn(change: Function) -> Function:
-    def call(*args: Any, **given: Any) -> Any:
-        with one_at_a_time:
-            return change(*args, **given)
-
-    return call
-
-
-def _update_in_turn(update: Function) -> Function:
-    def call(parameters: mi.SceneParameters, *args: Any, **given: Any) -> Any:
-        with one_at_a_time:
-            updated = update(parameters, *args, **given)
-            _note(parameters, dict(updated))
-            return updated
-
-    return call
+@change(
+    "mi.SceneParameters.__setitem__",
+    what="waits while such a scene is rendered",
+    why="a change in the midst of a render ends the process",
+)
+def set_in_turn(setitem: Function, /, *args: object) -> object:
+    with one_at_a_time:
+        return setitem(*args)
 
 
-def _note(parameters: mi.SceneParameters, updated: Mapping[mi.Object, set[str]]) -> None:
-    """Take note of the objects whose own parameters were updated: what contains them is updated, too."""
-    if updated and plugins.any_constructed():
-        for key, (_, _, node, _) in parameters.properties.items():
-            if key.rsplit(".", 1)[-1] in updated.get(node, ()):
+@change(
+    "mi.SceneParameters.update",
+    what="waits while such a scene is rendered, and notes what was updated",
+    why="numbers may have been written where they lie, which no array shows",
+)
+def update_in_turn(
+    update: Function, parameters: mi.SceneParameters, /, *args: object, **given: object
+) -> list[tuple[mi.Object, set[str]]]:
+    with one_at_a_time:
+        updated = update(parameters, *args, **given)
+        changed = dict(updated) if plugins.any_constructed() else {}
+        # What contains an object whose own parameters were updated is updated, too
+        for key, (_, _, node, _) in parameters.properties.items() if changed else ():
+            if key.rsplit(".", 1)[-1] in changed.get(node, ()):
                 updates.note(node)
+        return updated
 
 
 # ----------------------------------------------- Loading -----------------------------------------------
@@ -164,212 +251,83 @@ class TwoThreads:
 two_threads = TwoThreads()
 
 
-def _load_in_turn(loader: Function, source: str, has_ours: Callable[[Any], bool]) -> Function:
-    """``source``: the name of the loader's first parameter; ``has_ours``: may it have a plugin of ours."""
-
-    def load(*args: Any, **given: Any) -> Any:
-        what = args[0] if args else given.get(source)
-        values = [value for name, value in given.items() if name not in (source, "parallel", "optimize")]
-        free = len(args) < 2 and "parallel" not in given
-        if free and (has_ours(what) or any("mrt_" in str(value) for value in values)):
-            given = {**given, "parallel": False}
-        with two_threads:
-            return loader(*args, **given)
-
-    return load
+_LOADING = {
+    "what": "loads scenes with plugins of this project one object at a time, unless parallel= is given",
+    "why": "Mitsuba's parallel loader overflows the stack, or crashes, with hundreds of objects in Python",
+}
 
 
-def _dict_has_ours(source: Any) -> bool:
-    waiting, seen = [source], set[int]()  # a dict may lie in itself
-    while waiting:
+@change("mi.load_dict", **_LOADING)
+def load_dict_in_turn(load: Function, /, *args: object, **given: object) -> object:
+    waiting = [args[0] if args else given.get("dict")]
+    seen = set[int]()  # a dict may lie in itself
+    ours = False
+    while waiting and not ours:
         node = waiting.pop()
         if isinstance(node, dict) and id(node) not in seen:
             seen.add(id(node))
-            if str(node.get("type", "")).startswith("mrt_"):
-                return True
+            ours = str(node.get("type", "")).startswith("mrt_")
             waiting += node.values()
-    return False
+    return _load(load, ours, "dict", *args, **given)
 
 
-def _text_has_ours(source: Any) -> bool:
-    return isinstance(source, str) and any(hint.decode() in source for hint in HINTS)
+@change("mi.load_string", **_LOADING)
+def load_string_in_turn(load: Function, /, *args: object, **given: object) -> object:
+    text = args[0] if args else given.get("value")
+    ours = isinstance(text, str) and any(hint.decode() in text for hint in HINTS)
+    return _load(load, ours, "value", *args, **given)
 
 
-def _file_has_ours(source: Any) -> bool:
-    """Return whether a file of XML may have a plugin of ours: reads no more of it than tells.
+@change("mi.load_file", **_LOADING)
+def load_file_in_turn(load: Function, /, *args: object, **given: object) -> object:
+    path = args[0] if args else given.get("path")
+    ours = False
+    # Mitsuba itself reports what cannot be read. What is no file, such as a pipe, can be read only once
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        name = str(mi.file_resolver().resolve(os.fspath(path)))  # type: ignore[call-overload]
+        state = os.stat(name)
+        ours = not stat.S_ISREG(state.st_mode) or state.st_size > LARGEST_SEARCHED
+        if not ours:
+            with open(name, "rb") as file:
+                text = file.read(state.st_size)
+            ours = any(hint in text for hint in HINTS)
+    return _load(load, ours, "path", *args, **given)
 
-    Mitsuba itself reports what cannot be read. What is no file, such as a pipe, can be read only once.
-    """
-    if not isinstance(source, str | os.PathLike):
-        return False
-    try:
-        path = str(mi.file_resolver().resolve(os.fspath(source)))
-        state = os.stat(path)
-        if not stat.S_ISREG(state.st_mode) or state.st_size > LARGEST_SEARCHED:
-            return True
-        with open(path, "rb") as file:
-            text = file.read(state.st_size)
-    except (OSError, ValueError, TypeError):
-        return False
-    return any(hint in text for hint in HINTS)
+
+def _load(load: Function, ours: bool, source: str, /, *args: object, **given: object) -> object:
+    """Load a scene; ``ours``: may it have a plugin of ours; ``source``: name of the first parameter."""
+    values = [value for name, value in given.items() if name not in (source, "parallel", "optimize")]
+    free = len(args) < 2 and "parallel" not in given
+    if free and (ours or any("mrt_" in str(value) for value in values)):
+        given["parallel"] = False
+    with two_threads:
+        return load(*args, **given)
 
 
 # -------------------------------------------- Light tracing --------------------------------------------
 
 
-def _refuse_light_tracing(render: Function) -> Function:
-    def call(integrator: mi.Integrator, scene: mi.Scene, *args: Any, **given: Any) -> Any:
-        kind = plugins.plugin("light").MrtLight
-        for light in scene.emitters():
-            if isinstance(light, kind):
-                raise NotImplementedError(
-                    f"{_name_of(light)}: light tracing needs a finite emitted power; use a stock 'point' "
-                    "light"
-                )
-        return render(integrator, scene, *args, **given)
-
-    return call
-
-
-def _name_of(thing: object) -> str:
-    rows = [row.name for row in plugins.PLUGINS if row.class_name == type(thing).__name__]
-    return rows[0] if rows else type(thing).__name__
-
-
-# ----------------------------------------------- The list ----------------------------------------------
-
-
-@dataclass(frozen=True)
-class Replacement:
-    """A function that was put in place of one of Mitsuba's."""
-
-    owner: Any
-    name: str
-    before: Function
-    ours: Function
-    inherited: bool  # had the owner the function from a base class
-
-
-@dataclass
-class Change:
-    """Functions of Mitsuba's that are replaced."""
-
-    where: str  #: as users call it
-    names: tuple[str, ...]  #: of the functions
-    owner: Callable[[], Any]  #: what has them, in the current variant
-    around: Callable[[Function], Function]  #: makes the function in place of Mitsuba's
-    what: str
-    why: str
-    since: str = "Mitsuba 3.9"  #: the first release that needs it, as far as is known
-    #: the functions that were put in place, by owner and name, with what they are around
-    made: list[Replacement] = field(default_factory=list)
-
-    def make(self) -> None:
-        """Put the functions in place where they are not."""
-        owner = self.owner()
-        for name in self.names:
-            present = getattr(owner, name)
-            if self._contains_ours(present):
-                continue
-            ours = _disguised(self.around(present), present)
-            self.made.append(Replacement(owner, name, present, ours, inherited=name not in vars(owner)))
-            for each in (owner, _home(owner, name, present)):
-                setattr(each, name, ours)
-
-    def _contains_ours(self, function: Any) -> bool:
-        own = {id(each.ours) for each in self.made}
-        while function is not None:
-            if id(function) in own:
-                return True
-            function = getattr(function, "__wrapped__", None)
-        return False
-
-    def undo(self) -> None:
-        """Take the functions back; those that somebody else has put something around only pass calls on."""
-        kept = []
-        for each in reversed(self.made):
-            home = _home(each.owner, each.name, each.before)
-            if getattr(each.owner, each.name) is not each.ours:
-                kept.append(each)
-            elif each.inherited:
-                delattr(each.owner, each.name)
-            else:
-                setattr(each.owner, each.name, each.before)
-            if getattr(home, each.name) is each.ours:
-                setattr(home, each.name, each.before)
-        self.made = kept
-
-
-def _home(owner: Any, name: str, function: Function) -> Any:
-    """Return the module that a function of Mitsuba's is pickled by, or its owner."""
-    module = sys.modules.get(getattr(function, "__module__", None) or "")
-    return module if module is not None and inspect.ismodule(owner) and hasattr(module, name) else owner
-
-
-def _disguised(ours: Function, theirs: Function) -> Function:
-    """Return a function that calls ours while the changes are in effect; all else about it is theirs."""
-
-    @wraps(theirs)
-    def call(*args: Any, **given: Any) -> Any:
-        return (ours if _in_effect else theirs)(*args, **given)
-
-    with contextlib.suppress(ValueError, TypeError):  # functions in C++ have none
-        call.__signature__ = inspect.signature(theirs)  # type: ignore[attr-defined]
-    return call
-
-
-_in_effect = _watching = False
-
-
-def _loader(name: str, source: str, has_ours: Callable[[Any], bool]) -> Change:
-    return Change(
-        where=f"mi.{name}",
-        names=(name,),
-        owner=lambda: mi,
-        around=lambda loader: _load_in_turn(loader, source, has_ours),
-        what="loads scenes with plugins of this project one object at a time, unless parallel= is given",
-        why="Mitsuba's parallel loader overflows the stack, or crashes, with hundreds of objects in Python",
-    )
-
-
-CHANGES = (
-    Change(
-        where="mi.render",
-        names=("render",),
-        owner=lambda: mi,
-        around=_render_in_turn,
-        what="renders scenes with plugins of this project one after the other, and passes Ctrl-C on",
-        why="two threads that trace plugins in Python at once end the process; Dr.Jit turns a Ctrl-C in an "
-        "integrator in Python into a RuntimeError",
-    ),
-    Change(
-        where="mi.SceneParameters.__setitem__",
-        names=("__setitem__",),
-        owner=lambda: mi.SceneParameters,
-        around=_change_in_turn,
-        what="waits while such a scene is rendered",
-        why="a change in the midst of a render ends the process",
-    ),
-    Change(
-        where="mi.SceneParameters.update",
-        names=("update",),
-        owner=lambda: mi.SceneParameters,
-        around=_update_in_turn,
-        what="waits while such a scene is rendered, and notes what was updated",
-        why="numbers may have been written where they lie, which no array shows",
-    ),
-    _loader("load_dict", "dict", _dict_has_ours),
-    _loader("load_file", "path", _file_has_ours),
-    _loader("load_string", "value", _text_has_ours),
-    Change(
-        where="mi.AdjointIntegrator.render",
-        names=("render",),
-        owner=lambda: mi.AdjointIntegrator,
-        around=_refuse_light_tracing,
-        what="refuses scenes with mrt_light",
-        why="the light cannot do so itself: Dr.Jit calls its methods for scenes that have none, too",
-    ),
+@change(
+    "mi.AdjointIntegrator.render",
+    what="refuses scenes with mrt_light",
+    why="the light cannot do so itself: Dr.Jit calls its methods for scenes that have none, too",
 )
+def refuse_light_tracing(
+    render: Function, integrator: mi.Integrator, scene: mi.Scene, *args: object, **given: object
+) -> object:
+    kind = plugins.plugin("light").MrtLight
+    names = {row.class_name: row.name for row in plugins.PLUGINS}
+    for light in scene.emitters():
+        if isinstance(light, kind):
+            name = type(light).__name__
+            raise NotImplementedError(
+                f"{names.get(name, name)}: light tracing needs a finite emitted power; use a stock 'point' "
+                "light"
+            )
+    return render(integrator, scene, *args, **given)
+
+
+# --------------------------------------------- Putting in effect ---------------------------------------
 
 
 def make() -> None:
@@ -402,7 +360,7 @@ def rewriting_later() -> Iterator[None]:
     """
     rewrite = dr.syntax
 
-    def later(function: Function | None = None, **options: Any) -> Any:
+    def later(function: Function | None = None, **options: object) -> Function:
         if function is None or options:
             return rewrite(function, **options)
 
@@ -411,7 +369,7 @@ def rewriting_later() -> Iterator[None]:
             return rewrite(function)
 
         @wraps(function)
-        def call(*args: Any, **given: Any) -> Any:
+        def call(*args: object, **given: object) -> object:
             return rewritten()(*args, **given)
 
         return call
