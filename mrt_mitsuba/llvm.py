@@ -184,7 +184,9 @@ def prepare() -> Choice:
 
     Warns where the user's own setting is not followed, and where Dr.Jit was imported before the choice.
     """
-    choice, early, text = choose(), "drjit" in sys.modules, None
+    early = "drjit" in sys.modules
+    choice = choose()
+    text = None
     os.environ[VARIABLE] = choice.path or BLOCKED
     if early and choice.path:
         text = problem(choice)

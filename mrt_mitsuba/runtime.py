@@ -41,7 +41,8 @@ def use(variant: str | None = None) -> str:
         if variant is None:
             variant = mi.variant() or default_variant()
         elif variant not in mi.variants():
-            close, known = difflib.get_close_matches(variant, mi.variants(), n=1), ", ".join(mi.variants())
+            close = difflib.get_close_matches(variant, mi.variants(), n=1)
+            known = ", ".join(mi.variants())
             hint = f" Did you mean {close[0]}?" if close else ""
             raise UnknownVariantError(f"unknown variant {variant!r}.{hint} This Mitsuba has {known}.")
         if problem := obstacle(variant):

@@ -42,7 +42,9 @@ if TYPE_CHECKING:
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 GREY_WEIGHTS = (0.07, 0.72, 0.21)
-GAP, GREY = 4, 0.5  # between two pictures of contours: pixels; so that a contour at the border still shows
+# Between two pictures of contours; so that a contour at the border still shows
+GAP = 4  # pixels
+GREY = 0.5
 REACH = 1  # rows and columns of neighbours that a pixel depends on, either way
 
 

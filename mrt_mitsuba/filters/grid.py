@@ -39,7 +39,15 @@ class Grid:
         shape = np.shape(image)
         if len(shape) < 2:
             raise UsageError(f"image has shape {shape}; expected [rows, columns] or more")
-        self._tensor = importlib.import_module(f"drjit.{_backend(image)}").TensorXf
+        mitsuba = sys.modules.get("mitsuba")
+        if dr.is_tensor_v(image):
+            names = {dr.JitBackend.LLVM: "llvm", dr.JitBackend.CUDA: "cuda"}
+            backend = names.get(dr.backend_v(image), "scalar")
+        elif mitsuba and mitsuba.variant():
+            backend = mitsuba.variant().partition("_")[0]
+        else:
+            backend = "scalar" if llvm.problem(llvm.prepare()) else "llvm"
+        self._tensor = importlib.import_module(f"drjit.{backend}").TensorXf
         self._kind = type(image) if dr.is_tensor_v(image) else np.ndarray
         self.Float: Any = dr.array_t(self._tensor)
         self.Int: Any = dr.int32_array_t(self.Float)
@@ -116,18 +124,6 @@ class Grid:
             ours = dr.mask_t(ours)
             theirs = dr.mask_t(theirs)
         return theirs(ours(flat, shape))
-
-
-def _backend(image: Array) -> str:
-    """The module of Dr.Jit for a picture."""
-    if dr.is_tensor_v(image):
-        names = {dr.JitBackend.LLVM: "llvm", dr.JitBackend.CUDA: "cuda"}
-        return names.get(dr.backend_v(image), "scalar")
-    mitsuba = sys.modules.get("mitsuba")
-    variant = mitsuba.variant() if mitsuba else None
-    if variant:
-        return variant.partition("_")[0]
-    return "scalar" if llvm.problem(llvm.prepare()) else "llvm"
 
 
 def check_numbers(**options: float) -> None:

@@ -124,7 +124,8 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
         if array.shape != (*planes["RGB"].shape[:2], len(names)):
             raise OutputError(f"layer {name} of shape {array.shape} is no {' '.join(names)} of the picture")
         planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}
-    texts = {name: _plain(value) for name, value in header.items()}
+    plain = (str, int, float)
+    texts = {k: v if isinstance(v, plain) else json.dumps(v) for k, v in header.items()}
 
     # The library does not report a full disk when it opens the file itself, so the file is ours. It writes a
     # few rows at a time by code in Python: within its own code, and that of Python's files, a signal would
@@ -135,10 +136,6 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
     stream = SimpleNamespace(tell=file.tell, seek=file.seek, write=write)
     with compressing(image.shape[0] * image.shape[1]) as kind:
         OpenEXR.File({**texts, "compression": kind, "type": OpenEXR.scanlineimage}, planes).write(stream)
-
-
-def _plain(value: object) -> str | int | float:
-    return value if isinstance(value, str | int | float) else json.dumps(value)
 
 
 @contextlib.contextmanager

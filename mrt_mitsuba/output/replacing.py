@@ -141,30 +141,25 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
     """Give a new file in a folder, locked, with the rights of the user's umask; remove it at the end."""
     if folder not in _tidied:
         _tidied.add(folder)
-        _tidy(folder)
+        for left in Folder(folder).glob(_TEMPORARY.format(16 * "[0-9a-f]")):  # of processes that were killed
+            with contextlib.suppress(OSError):
+                state = left.lstat()
+                if stat.S_ISREG(state.st_mode) and time.time() - state.st_mtime > _OLD:
+                    with left.open("rb") as file:
+                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
+                        left.unlink()
     name = os.path.join(folder, _TEMPORARY.format(os.urandom(8).hex()))
     unfinished.add(name)
     try:
-        file = open(name, "x+b")  # noqa: SIM115 - closing it may fail
+        new = open(name, "x+b")  # noqa: SIM115 - closing it may fail
         try:
             with contextlib.suppress(OSError):  # not every file system can
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield file
+                fcntl.flock(new, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield new
         finally:
             with contextlib.suppress(OSError):  # a full disk has no room for the rest
-                file.close()
+                new.close()
     finally:
         with contextlib.suppress(OSError):
             os.unlink(name)
         unfinished.discard(name)
-
-
-def _tidy(folder: str) -> None:
-    """Remove the temporary files of killed processes."""
-    for left in Folder(folder).glob(_TEMPORARY.format(16 * "[0-9a-f]")):
-        with contextlib.suppress(OSError):
-            state = left.lstat()
-            if stat.S_ISREG(state.st_mode) and time.time() - state.st_mtime > _OLD:
-                with left.open("rb") as file:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
-                    left.unlink()

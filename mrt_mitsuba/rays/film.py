@@ -6,7 +6,7 @@ import math
 import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
 
-def opaque(number: float) -> Any:
+def opaque(number: float) -> mi.Float:
     """Return a number as data of a kernel, so that another needs no other kernel."""
     variant = mi.variant()
     if variant.startswith("scalar"):
@@ -24,7 +24,7 @@ def opaque(number: float) -> Any:
     return _data(variant, "UInt32" if isinstance(number, int) else "Float", number)
 
 
-def divide(n: Any, divisor: int) -> tuple[Any, Any]:
+def divide(n: mi.UInt32, divisor: int) -> tuple[mi.UInt32, mi.UInt32]:
     """Return quotient and remainder of whole numbers below 2³².
 
     A processor divides the integers of a packet one after the other, which takes as long as tracing the ray;
@@ -38,7 +38,9 @@ def divide(n: Any, divisor: int) -> tuple[Any, Any]:
     return quotient, n - quotient * _data(variant, "UInt32", divisor)
 
 
-_data = lru_cache(maxsize=64)(lambda variant, kind, number: dr.opaque(getattr(mi, kind), number))
+@lru_cache(maxsize=64)
+def _data(variant: str, kind: str, number: float) -> mi.Float:
+    return dr.opaque(getattr(mi, kind), number)
 
 
 class Region(NamedTuple):
@@ -51,13 +53,16 @@ class Region(NamedTuple):
 
     def grown(self, reach: int, width: int, height: int) -> Region:
         """Return the region with so many pixels around it, as far as the picture goes."""
-        left, top = max(self.x - reach, 0), max(self.y - reach, 0)
-        right, bottom = min(self.x + self.width + reach, width), min(self.y + self.height + reach, height)
+        left = max(self.x - reach, 0)
+        top = max(self.y - reach, 0)
+        right = min(self.x + self.width + reach, width)
+        bottom = min(self.y + self.height + reach, height)
         return Region(left, top, right - left, bottom - top)
 
     def inside(self, other: Region) -> tuple[slice, slice]:
         """Return its rows and columns in an array of another region's pixels."""
-        top, left = self.y - other.y, self.x - other.x
+        top = self.y - other.y
+        left = self.x - other.x
         return slice(top, top + self.height), slice(left, left + self.width)
 
 
@@ -95,7 +100,7 @@ class Places:
         """Return whether the pixel's centre is one of the lattice's samples; it then comes first."""
         return self.lattice == "report" or (self.lattice == "centered" and self.aa % 2 == 1)
 
-    def at(self, pixel: Any, ray: Any, width: int, height: int) -> tuple[Any, Any]:
+    def at(self, pixel: mi.UInt32, ray: mi.UInt32, width: int, height: int) -> tuple[mi.Point2f, mi.Float]:
         """Return where and when a ray of a pixel starts: its place in a picture of this size, [0, 1]², x to
         the right and y down, and its time."""
         row, column = divide(pixel, width)
@@ -105,21 +110,27 @@ class Places:
             sample = (sample + self.aa**2 // 2) % self.aa**2
         i, j = (mi.Float(number) for number in divide(sample, self.aa))
         n = mi.Float(opaque(self.aa))
-        x, y = (0.5 + i / n, 0.5 - j / n) if self.lattice == "report" else ((i + 0.5) / n, (j + 0.5) / n)
-        size = mi.Float(opaque(width)), mi.Float(opaque(height))
-        place = mi.Point2f((mi.Float(column) + x) / size[0], (mi.Float(row) + y) / size[1])
+        if self.lattice == "report":
+            x = 0.5 + i / n
+            y = 0.5 - j / n
+        else:
+            x = (i + 0.5) / n
+            y = (j + 0.5) / n
+        columns = mi.Float(opaque(width))
+        rows = mi.Float(opaque(height))
+        place = mi.Point2f((mi.Float(column) + x) / columns, (mi.Float(row) + y) / rows)
         if not self.moments:
             return place, mi.Float(0)
-        phase = (
-            mi.sample_tea_float32(pixel, opaque(self.seed))
-            if self.phase is None
-            else opaque(float(self.phase))
-        )
+        if self.phase is None:
+            phase = mi.sample_tea_float32(pixel, opaque(self.seed))
+        else:
+            phase = opaque(float(self.phase))
         # from one ray to the next, so many parts: coprime to their number, near its golden section
         golden = max(round(self.moments * (math.sqrt(5) - 1) / 2), 1)
         stride = next(s for s in range(golden, self.moments + 2) if math.gcd(s, self.moments) <= 1)
-        part = mi.UInt64(ray) * mi.UInt64(opaque(stride)) % mi.UInt64(opaque(self.moments))
-        return place, (mi.Float(part) + phase) / mi.Float(mi.UInt64(opaque(self.moments)))
+        moments = mi.UInt64(opaque(self.moments))
+        part = mi.UInt64(ray) * mi.UInt64(opaque(stride)) % moments
+        return place, (mi.Float(part) + phase) / mi.Float(moments)
 
 
 class Film:
@@ -128,18 +139,21 @@ class Film:
     Pixels are numbered row by row, with the border that it samples around the picture.
     """
 
-    def __init__(self, sensor: Any) -> None:
-        film, sampler = sensor.film(), sensor.sampler()
-        rfilter, found = film.rfilter(), re.search(r"pixel_format = (\w+)", str(film))
+    def __init__(self, sensor: mi.Sensor) -> None:
+        film = sensor.film()
+        sampler = sensor.sampler()
+        rfilter = film.rfilter()
         self.sensor = sensor
         #: pixels on either side to which a ray contributes
         self.reach = 0 if rfilter.is_box_filter() else int(rfilter.border_size())
         #: pixels that are sampled around the picture, and are no part of it
         self.border = int(rfilter.border_size()) if film.sample_border() else 0
         self.width, self.height = (int(n) + 2 * self.border for n in film.crop_size())  # with the border
-        self.shape, self.pixels = (self.height, self.width), self.height * self.width
+        self.shape = (self.height, self.width)
+        self.pixels = self.height * self.width
+        pixel_format = re.search(r"pixel_format = (\w+)", str(film))
         #: as the film prints it, "rgb" or "ya"; "" for a film of another kind
-        self.pixel_format = found[1] if found else ""
+        self.pixel_format = pixel_format[1] if pixel_format else ""
         self.grey = self.pixel_format in ("luminance", "y", "ya")
         self.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)  #: does it keep the coverage
         self.bands: tuple[str, ...] = ()  #: names of its spectral bands, if it has such
@@ -147,7 +161,8 @@ class Film:
             film.prepare([])  # it knows its channels from then on
             self.bands = tuple(field.name for field in film.bitmap().struct_())
         self.rays = int(sampler.sample_count())  #: of a pixel, as the scene's sampler has them
-        self.sampler, self.rfilter = sampler.class_name(), rfilter.class_name()
+        self.sampler = sampler.class_name()
+        self.rfilter = rfilter.class_name()
 
     def picture(self, sampled: np.ndarray) -> np.ndarray:
         """Return what lies in the picture, of an array [..., rows, columns, channels]."""
@@ -160,7 +175,7 @@ class Film:
         sampler.set_sample_count(count)
         return int(sampler.sample_count())
 
-    def place(self, pixel: Any, sampler: Any) -> tuple[Any, Any]:
+    def place(self, pixel: mi.UInt32, sampler: mi.Sampler) -> tuple[mi.Point2f, mi.Point2f]:
         """Return places in pixels that a sampler draws: on the film, and in the picture, [0, 1]²."""
         border = float(self.border)
         size = mi.Vector2f(opaque(self.width - 2 * border), opaque(self.height - 2 * border))
@@ -171,8 +186,10 @@ class Film:
     @cached_property
     def weights(self) -> np.ndarray:
         """Values of the filter along an axis, ``STEPS`` to a pixel, [2 reach + 1, STEPS]."""
-        places = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(STEPS) + 0.5) / STEPS - 0.5
-        rfilter, flat = self.sensor.film().rfilter(), places.ravel().tolist()
+        pixels = np.arange(-self.reach, self.reach + 1)[:, None]
+        places = pixels + (np.arange(STEPS) + 0.5) / STEPS - 0.5
+        flat = places.ravel().tolist()
+        rfilter = self.sensor.film().rfilter()
         if mi.variant().startswith("scalar"):
             values = [rfilter.eval(place) for place in flat]
         else:  # a list is copied; for NumPy's memory, Dr.Jit would compile a kernel for every alignment
@@ -199,7 +216,9 @@ class Film:
         for axis in (-2, -1) if self.reach else ():
             padding = [(0, 0)] * variance.ndim
             padding[axis] = (self.reach, self.reach)
-            wide = sliding_window_view(np.pad(variance, padding, mode="edge"), len(share), axis)
-            pairs = ((wide[..., k] + wide[..., -1 - k]) * share[k] for k in range(self.reach))  # symmetric
-            variance = sum(pairs, share[self.reach] * wide[..., self.reach])
+            padded = np.pad(variance, padding, mode="edge")
+            wide = sliding_window_view(padded, len(share), axis)
+            variance = share[self.reach] * wide[..., self.reach]
+            for k in range(self.reach):  # the filter is symmetric
+                variance = variance + (wide[..., k] + wide[..., -1 - k]) * share[k]
         return variance

@@ -72,6 +72,13 @@ class Result:
         when it is made again.
         """
         version = self.versions["mrt-mitsuba"]
+        estimated: dict[str, Any] = {}
+        if self.error is not None:
+            error = dataclasses.asdict(self.error)
+            if error["high"] == np.inf:
+                error["high"] = None  # JSON has no infinity
+            rounds = [{"spp": each.spp, "rmse": each.rmse} for each in self.rounds]
+            estimated = {"mrt:error": error, "mrt:rounds": rounds}
         return {
             "software": f"mrt-mitsuba {version}",
             "mrt:version": version,
@@ -79,18 +86,9 @@ class Result:
             "mrt:options": dict(self.options),
             "mrt:variant": self.plan.variant,
             **{f"mrt:{name}": self.versions[name] for name in ("mitsuba", "drjit", "llvm")},
-            **self._error_header(),
+            **estimated,
             **{f"mrt:{name}": matrix.tolist() for name, matrix in self.camera.items()},
         }
-
-    def _error_header(self) -> dict[str, Any]:
-        if self.error is None:
-            return {}
-        error = dataclasses.asdict(self.error)
-        if error["high"] == np.inf:
-            error["high"] = None  # JSON has no infinity
-        rounds = [{"spp": each.spp, "rmse": each.rmse} for each in self.rounds]
-        return {"mrt:error": error, "mrt:rounds": rounds}
 
     def _repr_png_(self) -> bytes:
         """Show the picture in a notebook, in sRGB as screens expect it."""

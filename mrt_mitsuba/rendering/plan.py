@@ -183,7 +183,12 @@ class Plan:
         if (part.width, part.height) != (self.width, self.height):
             lines += [f"  region  {part.width}x{part.height} from column {part.x}, row {part.y}"]
         if self.motion:
-            lines += [f"  pass    motion blur: {self._moments_in_words()}"]
+            moments = f"{self.moments} frames"
+            if self.motion == FILM:
+                moments = "each ray at its own moment"
+            elif self.motion == "stratified":
+                moments = f"at least {self.moments} moments in a pixel"
+            lines += [f"  pass    motion blur: {moments}"]
         lines += [f"  pass    {step}" for step in self.passes]
         if self.film:
             lines += [f"  film    {self.film}"]
@@ -194,13 +199,6 @@ class Plan:
         for why, group in groupby(self.left_out, lambda left_out: left_out[1]):
             lines += [f"  without {', '.join(what for what, _ in group)}: {why}"]
         return "\n".join(lines)
-
-    def _moments_in_words(self) -> str:
-        if self.motion == FILM:
-            return "each ray at its own moment"
-        if self.motion == "stratified":
-            return f"at least {self.moments} moments in a pixel"
-        return f"{self.moments} frames"
 
 
 @dataclass(frozen=True)
@@ -307,7 +305,8 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
 
 def _in_force(choices: _Choices, source: Source, shader: Shader, returned: frozenset[str]) -> dict[str, Any]:
     """The options that shape the picture, with the values that were decided."""
-    settings, goal = choices.settings, choices.goal
+    settings = choices.settings
+    goal = choices.goal
     values = {name: getattr(settings, name) for name in _NAMED} | {
         "width": source.width,
         "height": source.height,
@@ -442,7 +441,8 @@ def _passes(traced: frozenset[str], choices: _Choices, shader: Shader) -> Iterat
 
 def _samples(choices: _Choices, first: int = 0) -> Places:
     """The samples of a pixel from number ``first`` on."""
-    repeats, aa = choices.spp, choices.aa
+    repeats = choices.spp
+    aa = choices.aa
     count = aa**2 - first
     moments = choices.moments if choices.motion else 0
     stratified = choices.settings.motionmode == "stratified"
@@ -473,7 +473,12 @@ def _left_out(
     for name, why in shader.kernel.reasons if shader.kernel else ():
         yield kernel_plan.WHAT.get(name, name), why
     if Edges.name not in passes:
-        yield "edge pass", _edgeless(choices)
+        why = "aa=1 has no further samples to add"
+        if choices.goal:
+            why = "rounds go where the variance is"
+        elif choices.aamode == "none":
+            why = "aamode=none gives every pixel all its samples"
+        yield "edge pass", why
     if Blur.name not in passes:
         yield Blur.name, "no focal distance"
     if "depth" not in traced:
@@ -490,7 +495,7 @@ def _ignored(source: Source, film: Film, choices: _Choices) -> Iterator[tuple[st
         if source.own:
             yield (
                 f"{film.rfilter} and {film.sampler}",
-                ("the lattice that was asked for places and averages samples"),
+                "the lattice that was asked for places and averages samples",
             )
         return
     if film.pixel_format.startswith("xyz"):
@@ -505,12 +510,3 @@ def _ignored(source: Source, film: Film, choices: _Choices) -> Iterator[tuple[st
             yield film.sampler, "a scalar variant draws independent numbers, ray by ray"
     elif choices.goal:
         yield film.sampler, "rounds continue one sequence of numbers in each pixel"
-
-
-def _edgeless(choices: _Choices) -> str:
-    """Why nothing looks for edges."""
-    if choices.goal:
-        return "rounds go where the variance is"
-    if choices.aamode == "none":
-        return "aamode=none gives every pixel all its samples"
-    return "aa=1 has no further samples to add"

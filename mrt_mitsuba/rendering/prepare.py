@@ -32,7 +32,8 @@ class Prepared:
     _launch: Any = None  # what launches them; None where nothing is recorded
 
     def __init__(self, scene: Any, options: dict[str, Any]) -> None:
-        self._scene, self._settings = scene, RenderSettings.of(**options)
+        self._scene = scene
+        self._settings = RenderSettings.of(**options)
         with runtime.one_at_a_time, held():
             self._render(self._settings.seed)
             self._film_window = _window(self._source.sensor.film())
@@ -47,7 +48,8 @@ class Prepared:
             self._resize()
             if self._launch is None:
                 return self._render(seed)
-            plan, self._data = self._data.plan, self._source.integrator.prepare(self._source.scene)
+            plan = self._data.plan
+            self._data = self._source.integrator.prepare(self._source.scene)
             if self._data.plan != plan or self._look() is not self._state:
                 self._render(seed)
                 self._record()
@@ -79,34 +81,41 @@ class Prepared:
 
     def _look(self) -> Part:
         """Return the state of the camera and the integrator, the same object if it is the same."""
-        now, settings = Part(), vars(self._source.integrator)
+        now = Part()
+        settings = vars(self._source.integrator)
         now.add(self._source.sensor, ())
         now.state += [settings[name] for name in sorted(settings) if not name.startswith("_")]
         return now.close(self._state)
 
     def _record(self) -> None:
         """Record the kernels, if they read only what is known and give the picture that they should."""
-        self._launch, made, plan, sensor = None, self._made, self._made.plan, self._source.sensor
-        film, size = sensor.film(), [plan.width, plan.height]
+        self._launch = None
+        made = self._made
+        plan = made.plan
+        sensor = self._source.sensor
+        film = sensor.film()
+        size = [plan.width, plan.height]
         kinds = sensor.class_name(), sensor.sampler().class_name(), film.rfilter().class_name()
-        if not (
+        plain = (
             kinds == ("PerspectiveCamera", "IndependentSampler", "BoxFilter")
-            and plan.kernel is not None and plan.variant == "llvm_ad_rgb"
-            and [step.layers for step in plan.passes] == [{"image"}] and not plan.layers and not plan.motion
-            and plan.film in ("", "BoxFilter, rgb") and plan.passes[0].places.size == 1
-            and plan.region == plan.seen == (0, 0, *size) and sensor.shutter_open_time() == 0
+            and sensor.shutter_open_time() == 0
             and (list(film.crop_size()) != size or list(film.size()) == size)
-        ):  # fmt: skip
+        )
+        alone = [step.layers for step in plan.passes] == [{"image"}] and plan.passes[0].places.size == 1
+        whole = plan.region == plan.seen == (0, 0, *size) and plan.film in ("", "BoxFilter, rgb")
+        traced = plan.kernel is not None and plan.variant == "llvm_ad_rgb"
+        if not (plain and alone and whole and traced) or plan.layers or plan.motion:
             return
-        self._data, self._state = self._source.integrator.prepare(self._source.scene), None
+        self._state = None
+        self._data = self._source.integrator.prepare(self._source.scene)
         if self._data.arrays(self._source.scene) is None:
             return
         self._state = self._look()
-        self._sensor = mi.load_dict(
-            {"type": "perspective", "near_clip": sensor.near_clip(), "far_clip": sensor.far_clip(),
-             "film": {"type": "hdrfilm", "width": plan.width, "height": plan.height}}
-        )  # fmt: skip
-        own, theirs = mi.traverse(self._sensor), mi.traverse(sensor)
+        clip = {"near_clip": sensor.near_clip(), "far_clip": sensor.far_clip()}
+        own_film = {"type": "hdrfilm", "width": plan.width, "height": plan.height}
+        self._sensor = mi.load_dict({"type": "perspective", **clip, "film": own_film})
+        own = mi.traverse(self._sensor)
+        theirs = mi.traverse(sensor)
         names = "x_fov", "principal_point_offset_x", "principal_point_offset_y", "to_world"
         own.update({name: theirs[name] for name in names})
         self._size = dr.opaque(mi.Vector2f, size)
@@ -129,7 +138,8 @@ class Prepared:
 
     def _trace(self, seed: Any) -> list[Any]:
         """Return the channels along one ray of each pixel, at its centre or where the film's rules say."""
-        plan, offset = self._made.plan, mi.Point2f(0.5)
+        plan = self._made.plan
+        offset = mi.Point2f(0.5)
         pixel = dr.arange(mi.UInt32, plan.width * plan.height)
         if plan.film:
             sampler = mi.load_dict({"type": "mrt_rays"})

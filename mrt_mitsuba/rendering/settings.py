@@ -41,7 +41,9 @@ if TYPE_CHECKING:
 #: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
 #: the order of its arguments; those of the picture can distinguish noise from edges
 DETECTORS = {"luma": ("image",), "sobel": ("image",), "geometry": ("normal", "depth")}
-AA, AAMODE = 4, "sobel"  # of the report's scenes, where nothing else is asked for
+# Of the report's scenes, where nothing else is asked for
+AA = 4
+AAMODE = "sobel"
 FILM = "film"  # the lattice by the rules of a scene's film
 NOISE = "noise"  # the aamode that puts rays where the variance is
 MIN_SPP = 16  # rays of a pixel from which its variance is known

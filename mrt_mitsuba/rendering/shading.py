@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +19,10 @@ from mrt_mitsuba.plugins.variants import ByShape, text_of
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.scene.open import Source
 
+if TYPE_CHECKING:
+    from mrt_mitsuba.plugins.scene_data import SceneData
+    from mrt_mitsuba.plugins.whitted import Trace
+
 
 class RayValues:
     """Values along camera rays, for the rows of the table of layers; what no row reads costs nothing.
@@ -31,41 +35,47 @@ class RayValues:
     def __init__(
         self,
         shader: Shader,
-        ray: Any,
-        weight: Any,
-        radiance: Any,
-        valid: Any,
+        ray: mi.Ray3f,
+        weight: mi.Spectrum,
+        radiance: mi.UnpolarizedSpectrum,
+        valid: mi.Bool,
         *,
-        aovs: Any = (),
-        trace: Any = None,
+        aovs: Sequence[mi.Float] = (),
+        trace: Trace | None = None,
     ) -> None:
-        self.shader, self.scene, self.ray, self.trace = shader, shader.scene, ray, trace
-        self.weight, self.valid, self.aovs = mi.unpolarized_spectrum(weight), valid, aovs
+        self.shader = shader
+        self.scene = shader.scene
+        self.ray = ray
+        self.trace = trace
+        self.weight = mi.unpolarized_spectrum(weight)
+        self.valid = valid
+        self.aovs = aovs
         self.spectrum = radiance * self.weight  #: radiance with the sensor's weight
         self.image = to_rgb(self.spectrum, ray)
         if trace is not None:
-            self.si, self.found = trace.hit.si, trace.hit.found
+            self.si = trace.hit.si
+            self.found = trace.hit.found
 
     @cached_property
-    def si(self) -> Any:
+    def si(self) -> mi.SurfaceInteraction3f:
         """Interaction at the first hit."""
         return self.scene.ray_intersect(mi.Ray3f(self.ray))
 
     @cached_property
-    def found(self) -> Any:
+    def found(self) -> mi.Bool:
         """Is there a first hit."""
         return self.si.is_valid()
 
-    def at_hit(self, kind: str, value: Any, miss: float = 0) -> Any:
+    def at_hit(self, kind: str, value: mi.Float, miss: float = 0) -> mi.Float:
         """Return a value, of a type of Mitsuba's, where something is hit, and another elsewhere."""
         return dr.select(self.found, getattr(mi, kind)(value), miss)
 
-    def rgb(self, spectrum: Any) -> Any:
+    def rgb(self, spectrum: mi.UnpolarizedSpectrum) -> mi.Color3f:
         """Return the linear sRGB of a radiance along the rays, with the sensor's weight."""
         return to_rgb(spectrum * self.weight, self.ray)
 
     @property
-    def distance(self) -> Any:
+    def distance(self) -> mi.Float:
         """Distance of the first hit from the eye; along the ray where the sensor has no single eye."""
         sensor = self.shader.sensor
         if sensor.class_name() not in ("PerspectiveCamera", "ThinLensCamera"):
@@ -75,9 +85,10 @@ class RayValues:
         return dr.norm(self.si.p - eye)
 
     @property
-    def shape(self) -> Any:
+    def shape(self) -> mi.Float:
         """Number of the scene's shape that is hit first, from 1; 0 for a miss."""
-        hit, shapes = mi.SurfaceInteraction3f(self.si), self.scene.shapes()
+        hit = mi.SurfaceInteraction3f(self.si)
+        shapes = self.scene.shapes()
         if mi.variant().startswith("scalar"):
             hit.shape = hit.instance or hit.shape
         else:
@@ -85,7 +96,7 @@ class RayValues:
         return ByShape(mi.Float, shapes, range(1, len(shapes) + 1), 0.0)(hit, self.found)
 
     @property
-    def material(self) -> Any:
+    def material(self) -> mi.Float:
         """Number of the material that is hit first, from 1 in the order of the shapes; 0 for a miss, and in
         an instance."""
         numbers = dict[int, int]()
@@ -94,7 +105,7 @@ class RayValues:
         return ByShape(mi.Float, self.scene.shapes(), rows, 0.0)(self.si, self.found)
 
     @property
-    def albedo(self) -> Any:
+    def albedo(self) -> mi.Color3f:
         """Diffuse reflectance at the first hit; 0 for a miss."""
         albedo = mi.UnpolarizedSpectrum(0)
         if not mi.variant().startswith("scalar") or self.found:
@@ -116,9 +127,15 @@ class Shader:
 
     def __init__(self, source: Source, motion: Sequence[float] | None) -> None:
         integrator = source.integrator
-        self.scene, self.sensor, self.motion = source.scene, source.sensor, motion
-        self.width, self.height, self.film = source.width, source.height, Film(source.sensor)
-        self.integrator, self.name, self._data = integrator, integrator.class_name(), None
+        self.scene = source.scene
+        self.sensor = source.sensor
+        self.motion = motion
+        self.width = source.width
+        self.height = source.height
+        self.film = Film(source.sensor)
+        self.integrator = integrator
+        self.name = integrator.class_name()
+        self._data: SceneData | None = None
         #: names of those that can be traced, without internal ones
         self.layers = frozenset(name for name, layer in TABLE.items() if layer.source == FIRST_HIT)
         self._derivatives = isinstance(integrator, mi.CppADIntegrator)  # such as prb
@@ -127,7 +144,9 @@ class Shader:
                 self._data = integrator.prepare(self.scene)
             except ParameterError as error:
                 raise SceneError(str(error)) from None
-            self.name, self.facts, self.kernel = integrator.plugin_name, self._data.facts, self._data.plan
+            self.name = integrator.plugin_name
+            self.facts = self._data.facts
+            self.kernel = self._data.plan
             self.random = self.kernel.random
             self.layers |= integrator.provided_layers
         elif self._derivatives:
@@ -137,20 +156,22 @@ class Shader:
             self.layers = frozenset()
         self.aovs = tuple(integrator.aov_names())  #: names of the integrator's own channels
 
-    def shift(self, time: Any) -> Any:
+    def shift(self, time: mi.Float) -> mi.Vector3f:
         """Return how far the camera has moved."""
         if self.motion is None:
             return mi.Vector3f(0)
-        scalar = mi.variant().startswith("scalar")
-        return (mi.Vector3f(self.motion) if scalar else dr.opaque(mi.Vector3f, self.motion)) * time
+        if mi.variant().startswith("scalar"):
+            return mi.Vector3f(self.motion) * time
+        return dr.opaque(mi.Vector3f, self.motion) * time
 
-    def values(self, place: Any, time: Any, sampler: Any) -> RayValues:
+    def values(self, place: mi.Point2f, time: mi.Float | None, sampler: mi.Sampler) -> RayValues:
         """Return what is known along the rays through places in the picture, [0, 1]².
 
         ``time``: from 0, when the shutter opens, to 1; None: the sampler draws it, as for Mitsuba's sensors.
         Draws what Mitsuba's integrators draw, in their order.
         """
-        sensor, moment = self.sensor, time
+        sensor = self.sensor
+        moment = time
         aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         if time is None:
             moment = mi.Float(sensor.shutter_open())
@@ -166,18 +187,17 @@ class Shader:
             return RayValues(self, ray, weight, trace.radiance, trace.hit.found, trace=trace)
         differential = mi.RayDifferential3f(ray)
         if self._derivatives:
-            nothing = {"δL": None, "δaovs": None, "state_in": None}
-            radiance, valid, aovs, _ = self.integrator.sample(
-                mode=dr.ADMode.Primal, scene=self.scene, sampler=sampler, ray=differential,
-                depth=mi.UInt32(0), active=mi.Bool(True), **nothing,
-            )  # fmt: skip
+            primal = {"mode": dr.ADMode.Primal, "δL": None, "δaovs": None, "state_in": None}
+            start = {"ray": differential, "depth": mi.UInt32(0), "active": mi.Bool(True)}
+            sample = self.integrator.sample
+            radiance, valid, aovs, _ = sample(scene=self.scene, sampler=sampler, **start, **primal)
         else:
             medium = sensor.get_medium()  # that the camera is in
             radiance, valid, aovs = self.integrator.sample(self.scene, sampler, differential, medium)
         return RayValues(self, ray, weight, mi.unpolarized_spectrum(radiance), valid, aovs=aovs)
 
 
-def camera_matrices(sensor: Any) -> dict[str, np.ndarray]:
+def camera_matrices(sensor: mi.Sensor) -> dict[str, np.ndarray]:
     """Return the matrices of a camera, float64 [4, 4] for row vectors on their left, as EXR defines them.
 
     ``worldToCamera``: to a camera at the origin that looks along -z, with x to the right and y up.
@@ -188,20 +208,23 @@ def camera_matrices(sensor: Any) -> dict[str, np.ndarray]:
     if not np.isfinite(to_world).all() or np.linalg.matrix_rank(to_world) < 4:
         return {}
     # Mitsuba's cameras look along +z, with x to the left
-    found = {"worldToCamera": np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(to_world)}
-    numbers, film = mi.traverse(sensor), sensor.film()
+    matrices = {"worldToCamera": np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(to_world)}
+    numbers = mi.traverse(sensor)
+    film = sensor.film()
     names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
     fov, *shift = (np.array(numbers.get(name, 0.0)).item() for name in names)
     if fov:
-        size, crop = np.array(film.size(), float), np.array(film.crop_size(), float)
+        size = np.array(film.size(), float)
+        crop = np.array(film.crop_size(), float)
+        offset = np.array(film.crop_offset(), float)
         x, y = size[0] / (2 * np.tan(np.deg2rad(fov) / 2)) / crop  # widths and heights at a distance of one
-        centre_x, centre_y = ((0.5 - np.array(shift)) * size - np.array(film.crop_offset(), float)) / crop
+        centre_x, centre_y = ((0.5 - np.array(shift)) * size - offset) / crop
         projection = np.array([[x, 0, -centre_x, 0], [0, -y, -centre_y, 0], [0, 0, 1, 0], [0, 0, -1, 0]])
-        found["worldToNDC"] = projection @ found["worldToCamera"]
-    return {name: matrix.T for name, matrix in found.items()}
+        matrices["worldToNDC"] = projection @ matrices["worldToCamera"]
+    return {name: matrix.T for name, matrix in matrices.items()}
 
 
-def to_rgb(spectrum: Any, ray: Any) -> Any:
+def to_rgb(spectrum: mi.UnpolarizedSpectrum, ray: mi.Ray3f) -> mi.Color3f:
     """Return the linear sRGB of a spectrum in the current variant."""
     if mi.is_spectral:
         xyz = sum(

@@ -48,17 +48,17 @@ def read_text(path: Path) -> bytes:
     if b"\0" in data:
         raise SceneError(f"{path}: is not a text file (it holds a zero byte); export it as OBJ or MTL text")
     data = re.sub(rb"\r\n?", b"\n", data).removeprefix(b"\xef\xbb\xbf") + b"\n"
+
+    def joined(lines: re.Match[bytes]) -> bytes:
+        return lines[0].replace(_CONTINUED, b" ") + b"\n" * lines[0].count(_CONTINUED)
+
     if _CONTINUED in data:
-        data = re.sub(rb"(?m)^(?:.*\\\n)+.*\n", _joined, data)
+        data = re.sub(rb"(?m)^(?:.*\\\n)+.*\n", joined, data)
     longest = max(io.BytesIO(data), key=len).removesuffix(b"\n")
     if len(longest) > LONGEST_LINE:
         number = data.count(b"\n", 0, data.find(longest)) + 1
         raise SceneError(f"{path}:{number}: a line of {len(longest)} bytes; at most {LONGEST_LINE} are read")
     return data
-
-
-def _joined(lines: re.Match[bytes]) -> bytes:
-    return lines[0].replace(_CONTINUED, b" ") + b"\n" * lines[0].count(_CONTINUED)
 
 
 def decode(data: bytes) -> str:

@@ -69,16 +69,13 @@ def read_mtl(
             if statement in fields:
                 block[fields[statement]] = value
         # the report's reading defines itself; from the standard's, statements may be missing
-        elif convention == "standard" and _has_effect(statement, text):
-            findings.setdefault("statements", []).append(f"{where}: {statement} {text[:40]} is not used")
+        elif convention == "standard" and statement:
+            plain = re.sub(r"\.0+\b", "", f"{statement} {text}")
+            if plain not in _WITHOUT_EFFECT:
+                findings.setdefault("statements", []).append(f"{where}: {statement} {text[:40]} is not used")
     warn(findings)
     default = DEFAULT_MATERIAL if convention == "report" else _STANDARD
     return {name: replace(default, **block) for name, block in blocks.items()}
-
-
-def _has_effect(statement: str, text: str) -> bool:
-    """Whether a statement that is not used would change the picture."""
-    return bool(statement) and re.sub(r"\.0+\b", "", f"{statement} {text}") not in _WITHOUT_EFFECT
 
 
 def _value(

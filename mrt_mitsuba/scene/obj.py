@@ -183,7 +183,16 @@ class _Reader:
         warn({"libraries": self.missing, "materials": unknown})
         parts: dict[tuple[Material, bool], list[np.ndarray]] = {}
         for faces, kinds, name, line in self.faces:
-            self._check_faces(faces, kinds, line)
+            counts = np.array([*self.counts.values()])[kinds]
+            for row, corner, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
+                index = faces[row, corner, k] + 1
+                kind = [*_USED][kinds[k]]
+                problem = f"the {kind} index {index}, but the file has {counts[k]}"
+                if index < 1:
+                    problem = (
+                        f"a {kind} index of 0, or before the first; indices count from 1, or back from -1"
+                    )
+                self.fail(f"f has {problem}", line + row)
             material = self.materials.get(name, DEFAULT_MATERIAL)
             if 1 not in kinds:
                 material = replace(material, texture=None)  # no coordinates to look it up
@@ -198,17 +207,6 @@ class _Reader:
             raise SceneError(f"{self.path}: has no faces; export the model with its geometry")
         values = [np.concatenate(arrays) for arrays in self.values.values()]
         return tuple(_mesh(values, np.concatenate(fans), *which) for which, fans in parts.items())
-
-    def _check_faces(self, faces: np.ndarray, kinds: list[int], line: int) -> None:
-        """Refuse an index of a value that the file does not have."""
-        counts = np.array([*self.counts.values()])[kinds]
-        for row, corner, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
-            index = faces[row, corner, k] + 1
-            kind = [*_USED][kinds[k]]
-            problem = f"the {kind} index {index}, but the file has {counts[k]}"
-            if index < 1:
-                problem = f"a {kind} index of 0, or before the first; indices count from 1, or back from -1"
-            self.fail(f"f has {problem}", line + row)
 
 
 def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Material, smooth: bool) -> Mesh:

@@ -16,7 +16,6 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.scene.model import (
     BLUE_SKY,
     Camera,
-    Color,
     Cone,
     Cylinder,
     Light,
@@ -45,27 +44,36 @@ _ROW = [round(-1.5 + i / 3, 9) for i in range(10)]  # places of spheres, to nine
 _BLACK = (0.0, 0.0, 0.0)
 
 
-def _scene_0() -> Scene:
-    def sphere(x: float, y: float, z: float, color: Color) -> Sphere:
-        return Sphere((x, y, z), 0.25, glossy(color))
+_SCENES: list[Callable[[], Scene]] = []  # by number
 
-    def glossy(color: Color) -> Material:
-        return Material(ior=1.3, alpha=0.1, specular=(0.5, 0.5, 0.5), diffuse=color)
 
-    red = sphere(1, 0, 0, (0.5, 0, 0))
-    green = sphere(0, 1, 0, (0, 0.5, 0.5))
-    blue = sphere(0, 0, 1, (0, 0, 0.5))
+def _numbered(make: Callable[[], Scene]) -> Callable[[], Scene]:
+    """Give the scene that a function makes the next number."""
+    _SCENES.append(make)
+    return make
+
+
+@_numbered
+def scene_0() -> Scene:
+    def glossy(red: float, green: float, blue: float) -> Material:
+        return Material(ior=1.3, alpha=0.1, specular=(0.5, 0.5, 0.5), diffuse=(red, green, blue))
+
+    grey = Sphere((0, 0, 0), 0.25, glossy(0.5, 0.5, 0.5))
+    red = Sphere((1, 0, 0), 0.25, glossy(0.5, 0, 0))
+    green = Sphere((0, 1, 0), 0.25, glossy(0, 0.5, 0.5))
+    blue = Sphere((0, 0, 1), 0.25, glossy(0, 0, 0.5))
     return Scene(
         title="four spheres on a plane",
         camera=Camera((3, 1, 0), (0, 0.3, 0)),
         sky=(0.1, 0.3, 0.5),
         lights=(Light((10, 10, 10), (1, 1, 1)), Light((4, 10, -2), (1, 1, 1))),
-        spheres=(sphere(0, 0, 0, (0.5, 0.5, 0.5)), red, green, blue),
-        planes=(Plane((0, 1, 0), 0, glossy((0.6, 0.6, 0.6))),),
+        spheres=(grey, red, green, blue),
+        planes=(Plane((0, 1, 0), 0, glossy(0.6, 0.6, 0.6)),),
     )
 
 
-def _scene_1() -> Scene:
+@_numbered
+def scene_1() -> Scene:
     red = Material(ior=1.1382, alpha=0, specular=(1, 0.992, 0.98), diffuse=(0.301, 0.034, 0.039))
     blue = Material(ior=1.1153, alpha=0, specular=(1, 0.965, 1.07), diffuse=(0.012, 0.036, 0.106))
     floor = Material(ior=1.1481, alpha=0.0625, specular=(1, 1.056, 1.146), diffuse=(0.016, 0.073, 0.04))
@@ -82,7 +90,8 @@ def _scene_1() -> Scene:
     )
 
 
-def _scene_2() -> Scene:
+@_numbered
+def scene_2() -> Scene:
     pink = Material(ior=0, alpha=0, specular=(1, 0.748, 0.718), diffuse=(0.005, 0.013, 0.032))
     floor = Material(ior=1.1022, alpha=0.0579, specular=(0.95, 0.95, 0.95), diffuse=(0.05, 0.05, 0.05))
     spheres = []
@@ -103,7 +112,8 @@ def _scene_2() -> Scene:
     )
 
 
-def _scene_3() -> Scene:
+@_numbered
+def scene_3() -> Scene:
     gold = Material(ior=6, alpha=0.0181, specular=(0.7, 0.882, 0.786), diffuse=(0.014, 0.012, 0.012))
     red = Material(ior=1.3771, alpha=0.01589, specular=(1, 0.852, 1.172), diffuse=(0.26, 0.036, 0.014))
     ochre = Material(ior=1.5771, alpha=0.01589, specular=(0.8, 0.852, 0.8172), diffuse=(0.46, 0.136, 0.114))
@@ -136,7 +146,8 @@ def _scene_3() -> Scene:
     )
 
 
-def _scene_4() -> Scene:
+@_numbered
+def scene_4() -> Scene:
     floor = Material(ior=2.382, alpha=0.005886, specular=(0.2, 0.2, 0.2), diffuse=(0.2, 0.4, 0.3))
     left = Material(ior=2.8382, alpha=0.00886, specular=(0.2, 0.2, 0.1), diffuse=(0.5, 0.09, 0.07))
     right = Material(ior=2.9382, alpha=0.00886, specular=(0.5, 0.5, 0.5), diffuse=(0.1, 0.3, 0.05))
@@ -145,19 +156,29 @@ def _scene_4() -> Scene:
         Light((8, 20, 3), (2, 2, 2)),
         Light((4, 30, -1), (2.5, 2.5, 2.5)),
     )
+    spheres = []
+    numbers = c_rand()  # drawn in the original's order
+    for _ in range(600):
+        material = SCENE_4_MATERIALS[next(numbers) % 10]
+        radius = 0.05 + next(numbers) % 200 / 1000
+        z = 1 + next(numbers) % 650 / 100
+        y = next(numbers) % 650 / 100
+        x = 1 + next(numbers) % 650 / 100
+        spheres.append(Sphere((x, y, z), radius, material))
     return Scene(
         title="600 spheres in the corner of three planes",
         camera=Camera((6, 4, 6), (0, 1, 0), hfov=90),
         sky=BLUE_SKY,
         lights=lights,
-        spheres=tuple(_random_spheres(600)),
+        spheres=tuple(spheres),
         planes=(Plane((0, 1, 0), 0.2, floor), Plane((1, 0, 0), 2, left), Plane((0, 0, 1), 4, right)),
         focal_distance=0.1,
         focal_range=3.0,
     )
 
 
-def _scene_5() -> Scene:
+@_numbered
+def scene_5() -> Scene:
     mirror = Material(ior=6.0, alpha=0.02, specular=(0.9, 0.9, 0.9), diffuse=(0.02, 0.02, 0.02))
     copper = Material(ior=2.0, alpha=0.03, specular=(0.9, 0.85, 0.6), diffuse=(0.5, 0.06, 0.05))
     floor = Material(ior=1.3, alpha=0.1, specular=(0.25, 0.25, 0.25), diffuse=(0.55, 0.52, 0.5))
@@ -172,7 +193,8 @@ def _scene_5() -> Scene:
     )
 
 
-def _scene_6() -> Scene:
+@_numbered
+def scene_6() -> Scene:
     # surfaces of index 0, as in the report's files, have no mirror reflection
     grass = Material(ior=0.0, alpha=0.6, specular=_BLACK, diffuse=(0.22, 0.36, 0.12))
     bark = Material(ior=0.0, alpha=0.6, specular=_BLACK, diffuse=(0.3, 0.18, 0.1))
@@ -199,7 +221,8 @@ def _scene_6() -> Scene:
     )
 
 
-def _scene_7() -> Scene:
+@_numbered
+def scene_7() -> Scene:
     water = Material(ior=1.33, alpha=0.03, specular=(0.7, 0.75, 0.8), diffuse=(0.02, 0.08, 0.12))
     return Scene(
         title="a lake between hills",
@@ -211,7 +234,8 @@ def _scene_7() -> Scene:
     )
 
 
-def _scene_8() -> Scene:
+@_numbered
+def scene_8() -> Scene:
     floor = Material(ior=2.2, alpha=0.05, specular=(0.6, 0.6, 0.62), diffuse=(0.12, 0.12, 0.13))
     return Scene(
         title="a textured block on a glossy plane",
@@ -223,7 +247,8 @@ def _scene_8() -> Scene:
     )
 
 
-def _scene_9() -> Scene:
+@_numbered
+def scene_9() -> Scene:
     wood = Material(ior=1.0771, alpha=0.0589, specular=(0.26, 0.036, 0.014), diffuse=(1, 0.852, 1.172))
     dim = Light((2.8, -28.34, 4.33), (0.3764705882352941, 0.11176470588235295, 0.08431372549019608))
     return Scene(
@@ -236,18 +261,6 @@ def _scene_9() -> Scene:
     )
 
 
-_SCENES: tuple[Callable[[], Scene], ...] = (
-    _scene_0,
-    _scene_1,
-    _scene_2,
-    _scene_3,
-    _scene_4,
-    _scene_5,
-    _scene_6,
-    _scene_7,
-    _scene_8,
-    _scene_9,
-)
 NUMBERS = tuple(range(len(_SCENES)))
 
 
@@ -268,18 +281,6 @@ def _meshes(model: str) -> tuple[Mesh, ...]:
 
     meshes, _ = read_obj(Path(__file__).parent / "assets" / model)
     return meshes
-
-
-def _random_spheres(number: int) -> Iterator[Sphere]:
-    """The spheres of scene 4, in the order of the original's random numbers."""
-    numbers = c_rand()
-    for _ in range(number):
-        material = SCENE_4_MATERIALS[next(numbers) % 10]
-        radius = 0.05 + next(numbers) % 200 / 1000
-        z = 1 + next(numbers) % 650 / 100
-        y = next(numbers) % 650 / 100
-        x = 1 + next(numbers) % 650 / 100
-        yield Sphere((x, y, z), radius, material)
 
 
 def c_rand(seed: int = 1) -> Iterator[int]:

@@ -46,9 +46,28 @@ def reserved(folder: str) -> Iterator[tuple[str, dict[str, Facts]]]:
 
 @contextlib.contextmanager
 def _locked(folder: str) -> Iterator[bool]:
-    """Hold the lock of a folder within the block; yields False where its file system has no locks."""
+    """Hold the lock of a folder within the block; yields False where its file system has no locks.
+
+    Raises ``OutputError`` where another process has the lock.
+    """
     path = os.path.join(folder, LOCK)
-    file = _open_locked(path)
+    file: int | None = None
+    there = False
+    while not there:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            os.close(file)
+            reason = "another sweep works there; wait for it, or choose another folder"
+            raise OutputError(f"cannot write to the folder {folder}: {reason}") from None
+        except OSError:
+            os.close(file)
+            file = None
+            break
+        there = os.path.exists(path) and os.path.samestat(os.stat(path), os.fstat(file))
+        if not there:  # the sweep before has just removed it
+            os.close(file)
     unfinished.add(path)
     if file is None:
         text = f"the file system of {folder} has no locks: see to it that no other sweep writes there"
@@ -62,27 +81,6 @@ def _locked(folder: str) -> Iterator[bool]:
         if file is not None:
             fcntl.flock(file, fcntl.LOCK_UN)  # also for a child process that has the file open
             os.close(file)
-
-
-def _open_locked(path: str) -> int | None:
-    """A descriptor of a locked file; None where the file system has no locks.
-
-    Raises ``OutputError`` where another process has the lock.
-    """
-    while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except (BlockingIOError, PermissionError):
-            os.close(file)
-            reason = "another sweep works there; wait for it, or choose another folder"
-            raise OutputError(f"cannot write to the folder {os.path.dirname(path)}: {reason}") from None
-        except OSError:
-            os.close(file)
-            return None
-        if os.path.exists(path) and os.path.samestat(os.stat(path), os.fstat(file)):
-            return file
-        os.close(file)  # the sweep before has just removed it
 
 
 def _clear(folder: str) -> dict[str, Facts]:

@@ -69,18 +69,13 @@ def is_fresh(job: Job, folder: str, noted: Facts | None, png: bool = False) -> b
     for file, known in itertools.zip_longest(job.files(png), sums[: len(job.files(png))], fillvalue=""):
         path = os.path.join(folder, file)
         found = mark(path)
-        if os.path.lexists(path) and not found and (noted is None or not _is_damaged(path, known)):
+        # A file without a mark is what damage left of the noted one if it is no picture at all, or as long
+        damaged = os.path.isfile(path) and (found is None or known.endswith(f"/{os.path.getsize(path)}"))
+        if os.path.lexists(path) and not found and (noted is None or not damaged):
             text = "was not made by a sweep, which would replace it: move it away, or choose another folder"
             raise OutputError(f"{path} {text}")
         fresh = fresh and found == job.made_with and checksum(path) == known
     return fresh
-
-
-def _is_damaged(path: str, known: str) -> bool:
-    """Whether a file without a sweep's mark may be the noted one: no picture at all, or as long."""
-    if not os.path.isfile(path):
-        return False
-    return mark(path) is None or known.endswith(f"/{os.path.getsize(path)}")
 
 
 def cut(job: Job, tiles: Any) -> list[Job]:
@@ -164,11 +159,7 @@ def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
                     ]
                     planes = map(bytes, np.concatenate(blocks, axis=2))
                     picture.writePixels(dict(zip(names, planes, strict=True)), rows)
-        _read_last_row(file.name)  # the library does not report a full disk
-
-
-def _read_last_row(path: str) -> None:
-    """Raise what the EXR library does where a file ends too soon."""
-    file = OpenEXR.InputFile(path)
-    last = file.header()["dataWindow"].max.y
-    file.channel("R", scanLine1=last, scanLine2=last)
+        # The library does not report a full disk, but a row that is missing
+        written = OpenEXR.InputFile(file.name)
+        last = written.header()["dataWindow"].max.y
+        written.channel("R", scanLine1=last, scanLine2=last)

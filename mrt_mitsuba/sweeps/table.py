@@ -82,13 +82,6 @@ def _cell(value: Any) -> Any:
     return json.dumps(value, default=word) if isinstance(value, list | tuple) else word(value)
 
 
-def _facts(names: list[str], row: list[str]) -> dict[str, Any]:
-    """The facts of a row: its last columns, which have these names; "file" always, others where known."""
-    texts = dict(zip(names, row[-len(names) :], strict=True))
-    known = {name: FACTS[name](text) for name, text in texts.items() if text}
-    return {"file": ""} | known
-
-
 def _read(path: str) -> dict[str, dict[str, Any]]:
     """The facts of an earlier table by the name of the file."""
     if not os.path.exists(path):
@@ -97,5 +90,10 @@ def _read(path: str) -> dict[str, dict[str, Any]]:
         head, *rows = (row for row in csv.reader(file) if row)
         for names in ([*FACTS], BEFORE_CHECKSUMS):
             if head[-len(names) :] == names:
-                return {facts["file"]: facts for facts in (_facts(names, row) for row in rows)}
+                facts: dict[str, dict[str, Any]] = {}
+                for row in rows:  # its last columns have these names
+                    texts = dict(zip(names, row[-len(names) :], strict=True))
+                    known = {name: FACTS[name](text) for name, text in texts.items() if text}
+                    facts[texts["file"]] = {"file": ""} | known
+                return facts
     raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")
