@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +13,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.law import Skip, Subject
+from mrt_mitsuba.validation.checks.law import Given, Skip, Subject
 from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Lanes, Probe, is_scalar, joined, unit
 from mrt_mitsuba.validation.checks.sphere import DEPTH, POINTS, Cells, encode, integrate
 
@@ -50,7 +49,7 @@ class Case(Subject, Probe):
 
     word = "bsdf"
 
-    def __init__(self, given: Any, quick: bool, seed: int) -> None:
+    def __init__(self, given: Given, quick: bool, seed: int) -> None:
         super().__init__(given, quick, seed)
         if not isinstance(self.plugin, mi.BSDF):
             kind = type(self.plugin).__name__

@@ -19,6 +19,7 @@ from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.law import (
     TIMEOUT,
     Check,
+    Given,
     Law,
     Skip,
     Subject,
@@ -43,7 +44,7 @@ DARK = 5e-5  # share of the light: a fifth of a cone of 3 degrees
 
 
 def check_emitter(
-    emitter: Any,
+    emitter: Given,
     *,
     scene: mi.Scene | None = None,
     quick: bool = False,
@@ -59,7 +60,7 @@ def check_emitter(
     Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
     """
 
-    def case(given: Any, quick: bool, seed: int) -> Case:
+    def case(given: Given, quick: bool, seed: int) -> Case:
         return Case(given, quick, seed, scene)
 
     return examine(case, emitter, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
@@ -70,7 +71,7 @@ class Case(Subject):
 
     word = "emitter"
 
-    def __init__(self, given: Any, quick: bool, seed: int, scene: mi.Scene | None = None) -> None:
+    def __init__(self, given: Given, quick: bool, seed: int, scene: mi.Scene | None = None) -> None:
         super().__init__(given, quick, seed)
         if isinstance(self.plugin, mi.Shape) and self.plugin.emitter() is not None:
             scene = mi.load_dict({"type": "scene", "shape": self.plugin})

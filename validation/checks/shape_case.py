@@ -12,6 +12,7 @@ import numpy as np
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import law as laws
 from mrt_mitsuba.validation.checks.law import (
+    Given,
     Skip,
     Subject,
 )
@@ -81,7 +82,7 @@ class Case(Subject):
 
     word = "shape"
 
-    def __init__(self, given: Any, quick: bool, seed: int) -> None:
+    def __init__(self, given: Given, quick: bool, seed: int) -> None:
         super().__init__(given, quick, seed)
         if not all(hasattr(self.plugin, name) for name in ("ray_intersect", "ray_test", "bbox")):
             kind = type(self.plugin).__name__

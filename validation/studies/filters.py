@@ -14,7 +14,6 @@ least-squares fit of A − B/d to the disc that has the variance of its Pascal l
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.tools.renders import load
 from mrt_mitsuba.validation.tools.scenery import AT_CENTRES
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import Study, Values
 
 TITLE = "Filters: edges against noise, blur against a lens"
 
@@ -63,7 +62,7 @@ def noise(study: Study, *, quick: bool) -> None:
     contrast = np.ptp(np.lib.stride_tricks.sliding_window_view(luma, (3, 3)), axis=(2, 3))
     flat = contrast < FLAT
     edge = contrast > EDGE
-    rows: list[dict[str, Any]] = []
+    rows: list[Values] = []
     for detector, find in (("luma", filters.luma_edges), ("sobel", filters.sobel_edges)):
         for spp in counts:
             refined = mrt.render(scene, aa=2, aamode=detector, lattice="report", spp=spp).layers["samples.Y"]
@@ -88,13 +87,13 @@ def noise(study: Study, *, quick: bool) -> None:
 def depth_of_field(study: Study, *, quick: bool) -> None:
     """Blur sharp renders with each filter, and hold both to renders through the fitted lens."""
     width, height, aa, spp = (96, 72, 2, 12) if quick else (400, 300, 4, 32)
-    options: dict[str, Any] = {"aa": aa, "aamode": "none", "lattice": "centered", "focaldist": 0}
-    rows: list[dict[str, Any]] = []
+    options: Values = {"aa": aa, "aamode": "none", "lattice": "centered", "focaldist": 0}
+    rows: list[Values] = []
     for number in (3, 4):
         scene = report_scene(number)
         sharp = mrt.render(scene, width=width, height=height, layers=["depth"], **options)
         depth = sharp.layers["depth.Z"]
-        focus: dict[str, Any] = {"focal_distance": scene.focal_distance, "focal_range": scene.focal_range}
+        focus: Values = {"focal_distance": scene.focal_distance, "focal_range": scene.focal_range}
         pictures = {"sharp": sharp.image}
         pictures |= {mode: filters.gaussian_dof(sharp.image, depth, **focus, mode=mode) for mode in BLURS}
         nodes = scene.to_dict(width=width, height=height)

@@ -10,7 +10,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
@@ -20,7 +20,7 @@ from mrt_mitsuba.output import LAYERS
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan
 from mrt_mitsuba.rendering.api import Result
 from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.study import Study, in_turns, operations
+from mrt_mitsuba.validation.tools.study import Study, Values, in_turns, operations
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +40,7 @@ TITLES = {
     "seconds": "time",
 }
 
-REFINED: dict[str, Any] = {"aa": 4, "aamode": "sobel", "lattice": "report"}
+REFINED: Values = {"aa": 4, "aamode": "sobel", "lattice": "report"}
 
 Figures = dict[str, dict[str, float]]  # of ``MEASURES``, by the way
 
@@ -108,7 +108,7 @@ def run(study: Study, *, quick: bool) -> None:
 def show(study: Study, size: tuple[int, int], scenes: Sequence[int], repeats: int) -> None:
     """Add the bars and the table of scenes to a study."""
     found: dict[int, Figures] = {}
-    rows: list[dict[str, Any]] = []
+    rows: list[Values] = []
     for number in study.each(TITLE, scenes):
         found[number], result = measure(number, size, repeats)
         planned = found[number][PLANNED]
@@ -144,7 +144,7 @@ def savings(name: str, found: Mapping[int, Figures]) -> Figure:
     drawn, axes = diagrams.panel(TITLES[name], 4.6, 0.3 * len(found) + 1)
     axes.barh(rows, times, height=0.7, color="#f2b98f")
     axes.barh(rows, np.ones(len(rows)), height=0.7, color=diagrams.COLORS[0])
-    shown: dict[str, Any] = {"va": "center", "fontsize": diagrams.LABELS}
+    shown: Values = {"va": "center", "fontsize": diagrams.LABELS}
     for row, (own, factor) in enumerate(zip(planned, times, strict=True)):
         axes.text(max(factor, 1) + 0.02 * most, row, f"× {factor:.2f}", color=diagrams.TEXT, **shown)
         axes.text(0.02 * most, row, _quantity(own, name), color="white", **shown)

@@ -7,7 +7,6 @@ import os
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -21,7 +20,7 @@ from mrt_mitsuba.validation.checks.probe import is_scalar
 from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, lobe_pairs, relative_error
 from mrt_mitsuba.validation.tools.compare import compare, p_values
 from mrt_mitsuba.validation.tools.scenery import ball_scene
-from mrt_mitsuba.validation.tools.study import Study, in_turns, timed
+from mrt_mitsuba.validation.tools.study import Study, Values, in_turns, timed
 
 TITLE = "The BSDF against Mitsuba's roughconductor"
 
@@ -43,13 +42,13 @@ def run(study: Study, *, quick: bool) -> None:
     rendered(study, quick=quick)
 
 
-def ours(alpha: float, *, visible: bool = True) -> dict[str, Any]:
+def ours(alpha: float, *, visible: bool = True) -> Values:
     """Return ``mrt_bsdf`` with F = 1 and no diffuse part."""
     lobe = {"fresnel": "unity", "diffuse_reflectance": 0.0}
     return {"type": "mrt_bsdf", **lobe, "alpha": alpha, "sample_visible": visible}
 
 
-def theirs(alpha: float, *, visible: bool = True) -> dict[str, Any]:
+def theirs(alpha: float, *, visible: bool = True) -> Values:
     """Return ``roughconductor`` with F = 1."""
     lobe = {"material": "none", "distribution": "beckmann"}
     return {"type": "roughconductor", **lobe, "alpha": alpha, "sample_visible": visible}
@@ -81,7 +80,7 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> dict[str, f
 
 def pointwise(study: Study, *, quick: bool) -> None:
     """Compare values and densities, over roughness and in every variant that can run here."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Values] = []
     before = runtime.use()
     variants = runtime.usable_variants()
     if quick:  # every colour mode once, and one scalar variant

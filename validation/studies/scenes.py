@@ -11,7 +11,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import reference_render
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import Study, Values
 
 TITLE = "Pictures of the scenes, judged in float64"
 
@@ -103,11 +103,11 @@ def judge(
 def draw(scene: Any, size: Any, *, fresnel: str = "dielectric", **integrator: Any) -> np.ndarray:
     """Our picture, one sample per pixel, with no path cut short."""
     settings = {"type": "mrt_whitted", "min_contribution": 0.0, **integrator}
-    options: dict[str, Any] = {"width": size[0], "height": size[1], "aa": 1, "aamode": "none", "focaldist": 0}
+    options: Values = {"width": size[0], "height": size[1], "aa": 1, "aamode": "none", "focaldist": 0}
     return mrt.render(scene, **options, fresnel=fresnel, integrator=settings).image
 
 
-def hold(study: Study, name: str, error: np.ndarray, reason: np.ndarray) -> dict[str, Any]:
+def hold(study: Study, name: str, error: np.ndarray, reason: np.ndarray) -> Values:
     """Hold a scene that was judged to its bounds; return the figures by name."""
     most = CASES[name].most
     left = np.sum(reason == REASONS.index("unexplained"))
@@ -125,7 +125,7 @@ def hold(study: Study, name: str, error: np.ndarray, reason: np.ndarray) -> dict
 
 def run(study: Study, *, quick: bool) -> None:
     """Judge our pictures of all scenes, and the places of samples."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Values] = []
     for name, case in study.each("Scenes in float64", CASES.items()):
         size = case.sizes[quick]
         image = draw(case.scene, size, fresnel=case.fresnel)
@@ -142,11 +142,11 @@ def run(study: Study, *, quick: bool) -> None:
 def lattices(study: Study) -> None:
     """Hold four samples a pixel to those of the tracer, at the places that each lattice says."""
     scene = report_scene(0)
-    size: dict[str, Any] = {"width": 80, "height": 60}
+    size: Values = {"width": 80, "height": 60}
     for lattice, places in {"report": (0.0, 0.5), "centered": (-0.25, 0.25)}.items():
         samples = [reference_render(scene, displacement=place, **size) for place in product(places, repeat=2)]
         truth = np.mean([sample.image for sample in samples], axis=0)
-        options: dict[str, Any] = {"aa": 2, "aamode": "none", "focaldist": 0, "fresnel": "dielectric"}
+        options: Values = {"aa": 2, "aamode": "none", "focaldist": 0, "fresnel": "dielectric"}
         image = mrt.render(scene, lattice=lattice, **options, **size).image
         error = np.quantile(np.abs(image - truth).max(axis=-1), 0.99)
         why = "four times what was measured; least fault: samples in other places leave 0.07"

@@ -145,7 +145,7 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
 
 def other_ways(extent: Extent) -> Iterator[Pair]:
     """Yield searches by our tree against Mitsuba's, and what a plan leaves out."""
-    size: dict[str, Any] = {"width": extent.width, "height": extent.height}
+    size: Nodes = {"width": extent.width, "height": extent.height}
 
     def crowd(kind: str) -> Run:
         return _render(renders.crowd(extent.growth, kind, **size), layers=["depth"])
@@ -168,7 +168,7 @@ def other_ways(extent: Extent) -> Iterator[Pair]:
         yield Pair(f"scene 0 without {what} / with", make, 1.05, off, 0.5 / 255, why)
 
 
-def left_out(nodes: Nodes, change: Nodes, more: dict[str, Any]) -> tuple[Run, Run]:
+def left_out(nodes: Nodes, change: Nodes, more: Nodes) -> tuple[Run, Run]:
     """A scene, and the same with what its plan leaves out."""
     return _render(nodes), _render(nodes | change, **more)
 

@@ -33,6 +33,7 @@ from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.rendering.progress import Progress
 
 VALIDATION = "Validation of mrt-mitsuba"
+Values = dict[str, Any]  # by name: a row of a table, options, what describes a picture
 Item = TypeVar("Item")
 
 
@@ -67,7 +68,7 @@ class Bound:
     def __str__(self) -> str:
         return f"{self.verdict:<6} {self.name}: {self.measured:.4g} {self.sign} {self.limit:.4g}"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Values:
         """The values of ``summary.json``."""
         figures = {"measured": self.measured, "limit": self.limit, "sense": self.sign}
         return {"name": self.name, **figures, "holds": self.holds, "verdict": self.verdict, "note": self.note}
@@ -81,8 +82,8 @@ class Study:
     title: str
     progress: Progress = field(default_factory=Progress)
     texts: list[str] = field(default_factory=list)  # paragraphs
-    tables: dict[str, dict[str, Any]] = field(default_factory=dict)  # title, columns, rows, note, first
-    images: dict[str, dict[str, Any]] = field(default_factory=dict)  # title, content, caption
+    tables: dict[str, Values] = field(default_factory=dict)  # title, columns, rows, note, first
+    images: dict[str, Values] = field(default_factory=dict)  # title, content, caption
     bounds: list[Bound] = field(default_factory=list)
     goals: list[Bound] = field(default_factory=list)  # of speed: shown, but the verdict ignores them
     seconds: float = 0.0  # that it took
@@ -140,7 +141,7 @@ class Study:
                 gc.collect()
                 advance(1)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Values:
         """The study in values of JSON; infinite and undefined numbers become text."""
         found = {
             "title": self.title,
@@ -215,7 +216,7 @@ def operations(render: Callable[..., Any]) -> list[int]:
 # ---------------------------------------------- The report ---------------------------------------------
 
 
-def machine() -> dict[str, Any]:
+def machine() -> Values:
     """Everything that bears on speed or accuracy, without the name of the machine."""
     versions = dict(runtime.versions())
     return {
@@ -304,7 +305,7 @@ def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[st
     return files | {"summary.json": json.dumps(result, indent=2, allow_nan=False).encode() + b"\n"}
 
 
-def _drawn(content: Any) -> dict[str, Any]:
+def _drawn(content: Any) -> Values:
     """The bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
     buffer = io.BytesIO()
     if isinstance(content, np.ndarray):

@@ -25,7 +25,7 @@ from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation.tools import diagrams
 from mrt_mitsuba.validation.tools.compare import Array, Difference, compare, read_layer
-from mrt_mitsuba.validation.tools.study import Study, notebook, save_report
+from mrt_mitsuba.validation.tools.study import Study, Values, notebook, save_report
 
 TITLE = "Error against time"
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
@@ -156,13 +156,13 @@ class Findings:
             sentences.append(f"RMSE of {error:g}: {verdict}.")
         return sentences
 
-    def advice(self) -> list[dict[str, Any]]:
+    def advice(self) -> list[Values]:
         """A row for each of ``errors``: the case that gets there first, and the next other curve."""
         rows = []
         for error in self.errors:
             low = sorted((p for p in self.points.values() if p.rmse <= error), key=lambda p: p.seconds)
             others = [point for point in low if point.family != low[0].family]
-            row: dict[str, Any] = {"to get to an error of": error, "use": "nothing comes so low"}
+            row: Values = {"to get to an error of": error, "use": "nothing comes so low"}
             row |= {"seconds": None, "next best": None, "which takes": None}
             if low:
                 row |= {"use": low[0].name, "seconds": _shown(low[0].seconds, *low[0].seconds_interval)}
@@ -419,7 +419,7 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
     study.records(f"{prefix}points", f"{title}: every case", _rows(found), note)
 
 
-def _rows(found: Findings) -> list[dict[str, Any]]:
+def _rows(found: Findings) -> list[Values]:
     """The table of all cases, curve after curve."""
 
     def interval(ends: Interval) -> str:
