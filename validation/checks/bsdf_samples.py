@@ -79,8 +79,8 @@ def sampling(law: Law, case: Case) -> None:
         beyond.append(np.abs(view.share - cells.mean.sum()) - SIGMAS * np.sqrt(variance))
     by_angle = np.array([*tests, np.sum(tests, axis=0)])  # and of all angles together
     chances = stats.chi2.sf(by_angle[..., 0], by_angle[..., 1])
-    chance = sidak(float(chances.min()), chances.size)
-    i = int(chances[:-1].min(axis=1).argmin())
+    chance = sidak(chances.min(), chances.size)
+    i = chances[:-1].min(axis=1).argmin()
     law.hold("cells", chance, at.only(i), cell=worst[i], angles=len(judged))
     law.hold("integral", np.maximum(beyond, 0), at)
     broad = [view for view in case.views if 0 < view.density.max() < BROAD]
@@ -115,7 +115,7 @@ def _without_density(law: Law, case: Case) -> None:
     light = np.nan_to_num(value, posinf=0, neginf=0).sum(axis=1)
     missing = np.where(pdf == 0, light, 0)
     if light.sum() > 0:
-        i = int(missing.argmax())
+        i = missing.argmax()
         law.hold("dark", missing.sum() / light.sum(), wi=wi[i], wo=wo[i], uv=uv[i])
 
 
@@ -251,4 +251,4 @@ def _apart(case: Case, view: View, cells: Cells, s: Lanes) -> float:
     sigma = np.sqrt(error**2 + integrals.variance.sum(axis=0))
     beyond = np.maximum(np.abs(by_samples - by_quadrature) - SIGMAS * sigma, 0)
     larger = np.maximum(by_samples, by_quadrature)
-    return float((beyond / np.maximum(larger, 1e-3)).max())
+    return (beyond / np.maximum(larger, 1e-3)).max()

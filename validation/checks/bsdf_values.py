@@ -137,7 +137,7 @@ def _delta_either_way(law: Law, case: Case) -> None:
     if same.sum() < 20:
         return
     at = Lanes(wi=wi, uv=uv, u=u, back=v)
-    lost = int((same & ~returned).argmax())
+    lost = (same & ~returned).argmax()
     law.hold("returns", returned[same].mean(), at.only(lost))
 
     def followed(i: Array, _: Array, t: Array, u: Array) -> Array:

@@ -225,7 +225,7 @@ def sampling(law: Law, case: Case) -> None:
     integrals = integrate(case.density, cells, case.rng, codes, np.ones(len(codes)), len(codes))
     tests, _ = chi_square(integrals, codes, len(codes))
     chances = stats.chi2.sf(*tests.T)
-    law.hold("counts", sidak(float(chances.min()), len(chances)))
+    law.hold("counts", sidak(chances.min(), len(chances)))
     _without_density(law, case)
     if not probe.is_scalar():
         _in_small_cells(law, case)

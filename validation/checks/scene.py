@@ -157,9 +157,9 @@ def _hunt(source: Source, quick: bool, seed: int) -> Fault | None:
     with _cropped(source.sensor, alone):
         for count in COUNTS:
             if _bad(source, count, seed).any():
-                return Fault(int(bad.sum()), alone, count, _culprit(source, count, seed))
+                return Fault(bad.sum(), alone, count, _culprit(source, count, seed))
     whole = int(left), int(top), *bad.shape[::-1]
-    return Fault(int(bad.sum()), whole, spp, _culprit(source, spp, seed))
+    return Fault(bad.sum(), whole, spp, _culprit(source, spp, seed))
 
 
 def _bad(source: Source, spp: int, seed: int) -> np.ndarray:

@@ -335,7 +335,7 @@ def watertight(law: Law, case: Case) -> None:
     count = case.count(10**5, 10**6)
     o = inside[case.rng.integers(len(inside), size=count)]
     hits = trace(case.target, o, case.units(count))
-    out = stats.binomtest(count - int(hits.met.sum()), count)
+    out = stats.binomtest(count - hits.met.sum(), count)
     surely = out.proportion_ci(1 - 2 * LEVEL).low  # Clopper and Pearson
     law.hold("out", surely, hits.only(hits.met.argmin()), count=count)
 
@@ -503,7 +503,7 @@ def bbox(law: Law, case: Case) -> None:
         points.append(case.positions[0][0])
     p = np.concatenate(points)
     out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
-    worst = min(int(out.argmax()), len(met.t) - 1)
+    worst = min(out.argmax(), len(met.t) - 1)
     law.hold("outside", out.max(), met.only(worst))
 
 

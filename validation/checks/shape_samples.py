@@ -136,7 +136,7 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     estimate = 2 * np.pi * radius**2 * crossed.mean()
     error = 2 * np.pi * radius**2 * crossed.std() / np.sqrt(count)
     beyond = max(abs(estimate - area) - SIGMAS * error, 0)
-    room = 3e-3 + 20 * float(offset(p).max()) / case.size + twice
+    room = 3e-3 + 20 * offset(p).max() / case.size + twice
     law.hold("crossings", beyond / area, limit=room)
     if twice > ROOM:
         law.notes.append("parts of it coincide: where positions lie is not judged")
@@ -165,7 +165,7 @@ def _coinciding(case: Case, at: Lanes) -> float:
     one = trace(case.target, leave(at, at.n), -at.n)
     other = trace(case.target, leave(at, -at.n), at.n)
     both = one.met & other.met & (one.part != other.part)
-    return float((both & near(at.p, one.p) & near(at.p, other.p)).mean())
+    return (both & near(at.p, one.p) & near(at.p, other.p)).mean()
 
 
 def _is_edge_on(p: Array, axis: Array) -> bool:
@@ -192,13 +192,13 @@ def _distance(x: Array, y: Array, weight: Array | None = None) -> float:
     below = np.concatenate([[0], np.cumsum(weight[order])]) / weight.sum()
     y = np.sort(y)
     here = below[np.searchsorted(x[order], y, side="right")]
-    return float(np.abs(here - np.arange(1, len(y) + 1) / len(y)).max())
+    return np.abs(here - np.arange(1, len(y) + 1) / len(y)).max()
 
 
 def _chance(apart: Sequence[float], size: float) -> float:
     """The chance of such distances between samples of such a size (Kolmogorov and Smirnov, Šidák)."""
     beyond = max(max(apart) - ROOM, 0)
-    return sidak(float(stats.kstwobign.sf(beyond * np.sqrt(size))), len(apart))
+    return sidak(stats.kstwobign.sf(beyond * np.sqrt(size)), len(apart))
 
 
 def _directions(law: Law, case: Case, u: Array) -> None:

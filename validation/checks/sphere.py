@@ -132,7 +132,7 @@ class Cells(Lanes):
         ``variance``: of ``expected``; ``known``: to how much densities are known, relative.
         """
         chances = chances_of(seen, expected, variance, known)
-        return sidak(float(chances.min()), 2 * len(chances)), int(chances.argmin())
+        return sidak(chances.min(), 2 * len(chances)), chances.argmin()
 
     def rarest_slice(self, seen: Array, expected: Array, variance: Array, known: float) -> float:
         """The same for rows of cells of one r or azimuth, and slices along x and y."""
@@ -149,7 +149,7 @@ class Cells(Lanes):
             chances = chances_of(
                 np.bincount(row, seen), np.bincount(row, expected), np.bincount(row, variance), known
             )
-            least = min(least, float(chances.min()))
+            least = min(least, chances.min())
             tests += 2 * len(chances)
         return sidak(least, tests)
 
@@ -241,6 +241,6 @@ def chi_square(
         variance_in += expected_in + (known * expected_in) ** 2
         used = (seen_in > 0) | (expected_in > 1e-6)
         pull = (seen_in - expected_in)[used] ** 2 / np.maximum(variance_in, 1e-6)[used]
-        tests.append((float(pull.sum()), max(len(pull), 1)))
+        tests.append((pull.sum(), max(len(pull), 1)))
     worst = np.abs(seen - expected) / np.sqrt(expected + variance + 1)
-    return np.array(tests), integrals.bounds(int(worst.argmax()))
+    return np.array(tests), integrals.bounds(worst.argmax())
