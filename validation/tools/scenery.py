@@ -57,7 +57,7 @@ def ball_scene(bsdf: Node, *, size: int = 96) -> mi.Scene:
             "ball": _ball([0, 0, 0.7], 0.7, dict(bsdf)),
             "sky": _sky((0.3, 0.4, 0.6)),
             "lamp": {"type": "point", "position": [1.5, -2, 3], "intensity": rgb((12, 10, 8))},
-            "floor": _rectangle(_to().scale(4), bsdf=_diffuse(rgb((0.5, 0.4, 0.3)))),
+            "floor": _rectangle(_to().scale(4), bsdf=_diffuse((0.5, 0.4, 0.3))),
         }
     )
 
@@ -87,12 +87,14 @@ def _to() -> Any:
 
 
 def _checks(count: int) -> Node:
-    colors = {"color0": rgb(0.1), "color1": rgb(0.9)}
-    return {"type": "checkerboard", "to_uv": _to().scale([count, count, 1]), **colors}
+    """A diffuse chessboard."""
+    squares = _to().scale([count, count, 1])
+    board = {"type": "checkerboard", "to_uv": squares, "color0": rgb(0.1), "color1": rgb(0.9)}
+    return {"type": "diffuse", "reflectance": board}
 
 
-def _diffuse(reflectance: Any) -> Node:
-    return {"type": "diffuse", "reflectance": reflectance}
+def _diffuse(color: Any) -> Node:
+    return {"type": "diffuse", "reflectance": rgb(color)}
 
 
 def _rectangle(place: Any, **more: Node) -> Node:
@@ -101,6 +103,10 @@ def _rectangle(place: Any, **more: Node) -> Node:
 
 def _floor(bsdf: Node) -> Node:
     return _rectangle(_to().rotate([1, 0, 0], -90).scale(10), bsdf=bsdf)
+
+
+def _chessboard(count: int) -> Node:
+    return _floor(_checks(count))
 
 
 def _ball(center: Point, radius: float, bsdf: Node) -> Node:
@@ -124,26 +130,33 @@ SUN = np.full((16, 32, 3), 0.4, np.float32)
 SUN[3:5, 10:12] = 30
 
 
-def _scene_of(view: Node, **content: Node) -> Node:
-    return {"sensor": view, **content}
+SCENES: dict[str, Callable[[], Node]] = {}  # by the name of the function: the sensor and what it sees
 
 
-def _envmap() -> Node:
-    return _scene_of(
-        sensor([0, 2, 6], [0, 0.5, 0]),
+def scene(nodes: Callable[[], Node]) -> Callable[[], Node]:
+    """Add a function to ``SCENES``."""
+    SCENES[nodes.__name__] = nodes
+    return nodes
+
+
+@scene
+def envmap() -> Node:
+    return dict(
+        sensor=sensor([0, 2, 6], [0, 0.5, 0]),
         around={"type": "envmap", "bitmap": mi.Bitmap(SUN)},
-        floor=_floor(_diffuse(rgb(0.6))),
+        floor=_floor(_diffuse(0.6)),
         ball=_ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
     )
 
 
-def _instances() -> Node:
+@scene
+def instances() -> Node:
     """Nine balls that are one, in three rows."""
     group: Node = {"type": "ref", "id": "group"}
-    nodes = _scene_of(
-        sensor([0, 3, 6], [0, 0.5, 0], "box"),
-        group={"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(rgb(0.7)))},
-        floor=_floor(_diffuse(_checks(8))),
+    nodes = dict(
+        sensor=sensor([0, 3, 6], [0, 0.5, 0], "box"),
+        group={"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(0.7))},
+        floor=_chessboard(8),
         sky=_sky((0.3, 0.4, 0.5)),
         lamp=_lamp([3, 5, 3], 0.7, 20),
     )
@@ -154,20 +167,22 @@ def _instances() -> Node:
     return nodes
 
 
-def _thin_lens() -> Node:
+@scene
+def thin_lens() -> Node:
     lens: Node = {"type": "thinlens", "aperture_radius": 0.2, "focus_distance": 6.0}
-    return _scene_of(
-        sensor([0, 1.5, 6], [0, 0.6, 0], **lens),
-        floor=_floor(_diffuse(_checks(20))),
-        near=_ball([-1, 0.5, 3], 0.5, _diffuse(rgb((0.7, 0.2, 0.2)))),
-        far=_ball([1, 0.5, -2], 0.5, _diffuse(rgb((0.2, 0.2, 0.7)))),
+    return dict(
+        sensor=sensor([0, 1.5, 6], [0, 0.6, 0], **lens),
+        floor=_chessboard(20),
+        near=_ball([-1, 0.5, 3], 0.5, _diffuse((0.7, 0.2, 0.2))),
+        far=_ball([1, 0.5, -2], 0.5, _diffuse((0.2, 0.2, 0.7))),
         sky=_sky((0.6, 0.7, 0.9)),
     )
 
 
-def _gloss() -> Node:
-    return _scene_of(
-        sensor([0, 1.5, 5], [0, 0.7, 0], "box"),
+@scene
+def gloss() -> Node:
+    return dict(
+        sensor=sensor([0, 1.5, 5], [0, 0.7, 0], "box"),
         floor=_floor({"type": "roughconductor", "alpha": 0.1}),
         ball=_ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
         sky=_sky(0.2),
@@ -175,75 +190,67 @@ def _gloss() -> Node:
     )
 
 
-def _rough_glass() -> Node:
-    return _scene_of(
-        sensor([0, 1.2, 5], [0, 0.8, 0]),
-        floor=_floor(_diffuse(_checks(8))),
+@scene
+def rough_glass() -> Node:
+    return dict(
+        sensor=sensor([0, 1.2, 5], [0, 0.8, 0]),
+        floor=_chessboard(8),
         ball=_ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
         lamp=_lamp([0, 4, 0], 1.0, 6),
         sky=_sky(0.2),
     )
 
 
-def _area_light() -> Node:
+@scene
+def area_light() -> Node:
     above = _to().translate([0, 4, 0]).rotate([1, 0, 0], 90)
     behind = _to().translate([0, 2, -2]).scale(4)
-    return _scene_of(
-        sensor([0, 1.5, 6], [0, 1, 0], "mitchell"),
-        floor=_floor(_diffuse(rgb((0.8, 0.4, 0.3)))),
-        wall=_rectangle(behind, bsdf=_diffuse(rgb(0.5))),
+    return dict(
+        sensor=sensor([0, 1.5, 6], [0, 1, 0], "mitchell"),
+        floor=_floor(_diffuse((0.8, 0.4, 0.3))),
+        wall=_rectangle(behind, bsdf=_diffuse(0.5)),
         box=_box(),
         light=_rectangle(above, emitter={"type": "area", "radiance": rgb(6)}),
     )
 
 
-def _spot() -> Node:
+@scene
+def spot() -> Node:
     light: Node = {"type": "spot", "intensity": rgb((40, 36, 30)), "cutoff_angle": 25}
     light["to_world"] = _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])
-    return _scene_of(
-        sensor([0, 3, 6], [0, 0.5, 0], "tent"),
-        floor=_floor(_diffuse(rgb(0.7))),
+    return dict(
+        sensor=sensor([0, 3, 6], [0, 0.5, 0], "tent"),
+        floor=_floor(_diffuse(0.7)),
         box={"type": "cube", "to_world": _to().translate([0, 0.5, 0]).scale(0.5)},
         light=light,
     )
 
 
-def _crop() -> Node:
-    return _scene_of(
-        sensor([0, 2, 6], [0, 0.5, 0], film={"sample_border": True}),
-        floor=_floor(_diffuse(_checks(8))),
+@scene
+def crop() -> Node:
+    return dict(
+        sensor=sensor([0, 2, 6], [0, 0.5, 0], film={"sample_border": True}),
+        floor=_chessboard(8),
         ball=_ball([0, 1, 0], 1, {"type": "plastic"}),
         lamp=_lamp([2, 4, 2], 0.5, 15),
     )
 
 
-def _texture_and_sky() -> Node:
-    return _scene_of(
-        sensor([0, 1.5, 6], [0, 2.5, 0], fov=60),
-        floor=_floor(_diffuse(_checks(30))),
-        ball=_ball([-1, 0.6, 1], 0.6, _diffuse(_checks(12))),
+@scene
+def texture_and_sky() -> Node:
+    return dict(
+        sensor=sensor([0, 1.5, 6], [0, 2.5, 0], fov=60),
+        floor=_chessboard(30),
+        ball=_ball([-1, 0.6, 1], 0.6, _checks(12)),
         sky=_sky((0.5, 0.7, 1.0)),
     )
 
 
-def _stratified() -> Node:
-    return _scene_of(
-        sensor([0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
-        floor=_floor(_diffuse(_checks(8))),
+@scene
+def stratified() -> Node:
+    return dict(
+        sensor=sensor([0, 2, 6], [0, 0.5, 0], "box", sampler="stratified"),
+        floor=_chessboard(8),
         box=_box(),
         lamp=_lamp([0, 4, 1], 1.0, 5),
     )
-
-
-SCENES: dict[str, Callable[[], Node]] = {
-    "envmap": _envmap,
-    "instances": _instances,
-    "thin_lens": _thin_lens,
-    "gloss": _gloss,
-    "rough_glass": _rough_glass,
-    "area_light": _area_light,
-    "spot": _spot,
-    "crop": _crop,
-    "texture_and_sky": _texture_and_sky,
-    "stratified": _stratified,
-}
