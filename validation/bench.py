@@ -113,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         before = read(given.compare) if given.compare else {}
         prepare_folder(given.out.parent, given.out.name)
         print(62 * " " + "".join(f"{column:>14}" for column in COLUMNS))
-        found: dict[str, Row] = {}
+        found = {}
         for name, row in rows(given):
             key = "ratio" if "ratio" in row else "seconds"
             then = before.get(name, {}).get(key)

@@ -184,7 +184,7 @@ class Case(Subject, Probe):
     def lit(self) -> Lanes:
         """The pairs with a value, away from the horizon, over which values jump."""
         p = self.pairs
-        up = (np.abs(p.wo[:, 2]) > 0.05) & (np.abs(p.wi[:, 2]) > 0.05)
+        up = (abs(p.wo[:, 2]) > 0.05) & (abs(p.wi[:, 2]) > 0.05)
         return p.only(up & np.isfinite(p.value).all(axis=1) & (p.value > 0).any(axis=1))
 
     def spread(
@@ -223,7 +223,7 @@ def narrow(wi: Array, s: Lanes) -> Array:
     drawn = ~s.delta & (s.pdf > 0)
     too_narrow = np.zeros(len(s.pdf), bool)
     # a lobe of width w along the plane of incidence is w cos θ wide across: density 1 / (w² cos θ)
-    sharpness = s.pdf / np.abs(wi[..., 2])
+    sharpness = s.pdf / abs(wi[..., 2])
     for component in np.unique(s.component[drawn]):
         part = drawn & (s.component == component)
         too_narrow |= part & (np.median(sharpness[part]) > NARROW**-2)

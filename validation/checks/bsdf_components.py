@@ -90,7 +90,7 @@ def _component(law: Law, case: Case, i: int, flag: int, value: Array) -> int:
     s = case.sample(wi, u, uv, context(i))
     drawn = s.lit & np.isfinite(s.weight).all(axis=1)
     bad = (s.component != i) | ((s.type & ~flag) != 0) | (s.type == 0)
-    bad |= (np.abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, wi, s.wo)
+    bad |= (abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, wi, s.wo)
     law.hold("samples", drawn & bad, component=i, wi=wi, uv=uv, u=u)
     # sides that flags name and where there is no light, of a component that has some
     z = np.concatenate([p.wi[lit, 2], wi[drawn, 2]])

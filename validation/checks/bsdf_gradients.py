@@ -119,14 +119,14 @@ def _attached(law: Law, case: Case, key: str) -> bool:
     if not attached and not slope.any():
         law.notes.append(f"{key} changes no value")
         _reached(law, case, key)
-    off = np.abs(derivative - slope)
+    off = abs(derivative - slope)
     known = np.isfinite(error)
     if known.sum() < 20:
         law.notes.append(f"{key}: its least differences move lobes away, and cannot judge derivatives")
         return True
     usual = known & (off <= np.quantile(off[known], 0.98))  # where values have a kink, no slope is
     beyond = np.maximum(off - error, 0)[usual].sum()
-    measured = beyond / max(np.abs(slope)[usual].sum(), np.abs(derivative)[usual].sum(), 1e-30)
+    measured = beyond / max(abs(slope)[usual].sum(), abs(derivative)[usual].sum(), 1e-30)
     i = int(np.where(usual, off, 0).argmax())
     how = "" if attached else " (detached)"
     law.hold("values", measured, few.only(i), key=key, how=how)
@@ -175,21 +175,21 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     s = case.sample(wi, u, uv)
     value, pdf = case.both(wi, np.nan_to_num(s.wo), uv)
     counts = live(wi, s, value, pdf) & ~narrow(wi, s)
-    counts &= np.isfinite(derivative) & np.isfinite(expected) & (np.abs(wi[:, 2]) > 0.05)
-    counts &= (np.abs(s.wo[:, 2]) > 0.05) & (s.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
+    counts &= np.isfinite(derivative) & np.isfinite(expected) & (abs(wi[:, 2]) > 0.05)
+    counts &= (abs(s.wo[:, 2]) > 0.05) & (s.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
     if not attached or counts.sum() < 100:
         return
     apart = np.where(counts, derivative - expected, 0)
-    i = int(np.abs(apart).argmax())
+    i = int(abs(apart).argmax())
     known = apart[counts]
-    size = max(np.abs(expected[counts]).mean(), 1e-3 * np.abs(s.weight[counts]).mean(), 1e-30)
+    size = max(abs(expected[counts]).mean(), 1e-3 * abs(s.weight[counts]).mean(), 1e-30)
     if np.any(moves):
         figure = "mean"
         known = np.clip(known, *np.quantile(known, (1e-3, 1 - 1e-3)))
         off = max(abs(known.mean()) - SIGMAS * known.std() / np.sqrt(len(known)), 0)
     else:
         figure = "weights"
-        known = np.abs(known)
+        known = abs(known)
         off = known[known <= np.quantile(known, 0.98)].mean()
     law.hold(figure, off / size, wi=wi[i], uv=uv[i], u=u[i], key=key)
 
@@ -218,7 +218,7 @@ def _reached(law: Law, case: Case, key: str) -> None:
 
 def _moved(old: mi.Float, shift: mi.Float) -> mi.Float:
     """A parameter with ``shift`` of each number added: a spectrum's may be of many sizes."""
-    usual = float(np.mean(np.abs(np.array(old)))) or 0.05
+    usual = float(np.mean(abs(np.array(old)))) or 0.05
     size = dr.select(old == 0, usual, dr.abs(dr.detach(old)))
     return type(old)(old + size * shift)
 
@@ -249,10 +249,10 @@ def _differences(case: Case, key: str) -> tuple[Array, Array]:
     before = np.array([at(-step) for step in WIDTHS])
     across = 2 * np.array(WIDTHS)[:, None]
     slopes = (after - before) / across
-    bent = np.abs(after - 2 * here + before)
-    sides = np.where(bent <= 0.25 * np.abs(here), bent / across, np.inf)
-    rounding = 2.0**-22 * np.abs(here) / across
-    error = 2 * np.abs(np.diff(slopes, axis=0)) + sides[1:] + rounding[1:]
+    bent = abs(after - 2 * here + before)
+    sides = np.where(bent <= 0.25 * abs(here), bent / across, np.inf)
+    rounding = 2.0**-22 * abs(here) / across
+    error = 2 * abs(np.diff(slopes, axis=0)) + sides[1:] + rounding[1:]
     best = error.argmin(axis=0)
     lanes = np.arange(len(best))
     return slopes[1:][best, lanes], error[best, lanes]

@@ -76,7 +76,7 @@ def sampling(law: Law, case: Case) -> None:
         tests.append(test)
         worst.append(cell)
         variance = view.share * (1 - view.share) / view.count + cells.variance.sum()
-        beyond.append(np.abs(view.share - cells.mean.sum()) - SIGMAS * np.sqrt(variance))
+        beyond.append(abs(view.share - cells.mean.sum()) - SIGMAS * np.sqrt(variance))
     by_angle = np.array([*tests, np.sum(tests, axis=0)])  # and of all angles together
     chances = stats.chi2.sf(by_angle[..., 0], by_angle[..., 1])
     chance = sidak(chances.min(), chances.size)
@@ -249,6 +249,6 @@ def _apart(case: Case, view: View, cells: Cells, s: Lanes) -> float:
     by_samples, error = _mean(smooth)
     by_quadrature = integrals.mean.sum(axis=0)
     sigma = np.sqrt(error**2 + integrals.variance.sum(axis=0))
-    beyond = np.maximum(np.abs(by_samples - by_quadrature) - SIGMAS * sigma, 0)
+    beyond = np.maximum(abs(by_samples - by_quadrature) - SIGMAS * sigma, 0)
     larger = np.maximum(by_samples, by_quadrature)
     return (beyond / np.maximum(larger, 1e-3)).max()

@@ -95,17 +95,17 @@ def reciprocity(law: Law, case: Case) -> None:
 
     E. Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, § 5.2.
     """
-    few = case.pairs.only(np.abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
+    few = case.pairs.only(abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
     pairs = few.wi, few.wo, few.uv, few.eta
 
     def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
-        return case.eval(i, o, t) / np.abs(o[:, 2:]) * eta[:, None] ** 2
+        return case.eval(i, o, t) / abs(o[:, 2:]) * eta[:, None] ** 2
 
     def back(i: Array, o: Array, t: Array, _: Array) -> Array:
-        return case.eval(o, i, t) / np.abs(i[:, 2:])
+        return case.eval(o, i, t) / abs(i[:, 2:])
 
     def importance(i: Array, o: Array, t: Array, _: Array) -> Array:
-        return case.eval(i, o, t, context(importance=True)) / np.abs(o[:, 2:])
+        return case.eval(i, o, t, context(importance=True)) / abs(o[:, 2:])
 
     value = forth(*pairs)
     allowed = case.spread(forth, *pairs)
@@ -117,7 +117,7 @@ def reciprocity(law: Law, case: Case) -> None:
     s, at = case.drawn
     reflected = ((s.type & int(mi.BSDFFlags.Reflection)) != 0) & s.lit
     if reflected.any():
-        off = np.nan_to_num(np.abs(s.eta - 1), nan=np.inf)
+        off = np.nan_to_num(abs(s.eta - 1), nan=np.inf)
         law.hold("medium", np.where(reflected, off, 0), at)
 
 
@@ -132,8 +132,8 @@ def _delta_either_way(law: Law, case: Case) -> None:
     wo = probe.unit(np.where(np.isfinite(forth.wo), forth.wo, 1))
     back = case.sample(wo, v, uv)
     same = forth.delta & (forth.type == back.type) & (forth.component == back.component)
-    same &= np.abs(wi[:, 2] * wo[:, 2]) > 1e-3
-    returned = (np.abs(probe.unit(back.wo) - wi) < 1e-3).all(axis=1)
+    same &= abs(wi[:, 2] * wo[:, 2]) > 1e-3
+    returned = (abs(probe.unit(back.wo) - wi) < 1e-3).all(axis=1)
     if same.sum() < 20:
         return
     at = Lanes(wi=wi, uv=uv, u=u, back=v)
@@ -151,7 +151,7 @@ def _delta_either_way(law: Law, case: Case) -> None:
     error = excess(followed(*there), followed(*and_back), allowed)
     law.hold("single", np.where(same & returned, error, 0), at)
     other = case.sample(wi, u, uv, context(importance=True))  # by the same random numbers
-    alike = forth.delta & (np.abs(other.wo - forth.wo) < 1e-3).all(axis=1)
+    alike = forth.delta & (abs(other.wo - forth.wo) < 1e-3).all(axis=1)
     error = excess(forth.weight * forth.eta[:, None] ** 2, other.weight)
     law.hold("single_modes", np.where(alike, error, 0), at)
 
@@ -227,7 +227,7 @@ def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None =
     samples = {
         "weights of samples": _bad(s.weight),
         "densities of samples": s.lit & _bad(s.pdf),  # where the weight is 0, nothing more is read
-        "directions of samples": s.lit & ~(np.abs(length - 1) < 1e-3),
+        "directions of samples": s.lit & ~(abs(length - 1) < 1e-3),
     }
     wrong_values = np.any([*values.values()])
     kinds = values if wrong_values else samples
@@ -286,7 +286,7 @@ def roundoff(law: Law, case: Case) -> None:
     """Noise of float32 evaluation beyond what the rounding of the directions explains (``noise``)."""
     case.need_smooth()
     p = case.pairs
-    steep = (np.abs(p.wi[:, 2]) > 0.1) & (np.abs(p.wo[:, 2]) > 0.1)
+    steep = (abs(p.wi[:, 2]) > 0.1) & (abs(p.wo[:, 2]) > 0.1)
     # far off a lobe, an exponent of 40 makes 40 roundings of one: of nothing
     lit = p.only(steep & (p.pdf > 1e-3) & (p.value.max(axis=1) > 1e-20))
     few = lit.only(slice(0, case.count(500, 2000)))

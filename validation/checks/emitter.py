@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.linalg import norm
 from scipy import stats
 
 from mrt_mitsuba.errors import UsageError
@@ -88,7 +89,7 @@ class Case(Subject):
         points = self.rng.uniform(low - outer, high + outer, (2**12, 3))
         self.points = np.float32(points)
         if alone:
-            self._look_from_the_light(float(np.linalg.norm(high - low)))
+            self._look_from_the_light(float(norm(high - low)))
         flags = int(self.plugin.flags())
         # whether light comes from all around, and not from single directions, a surface or a point
         infinite = flags & int(mi.EmitterFlags.Infinite)
@@ -96,7 +97,7 @@ class Case(Subject):
 
     def _lit_sphere(self) -> mi.Scene:
         """A scene with the emitter and a sphere; what lights from a surface lights from a square."""
-        nodes: dict[str, Any] = {"type": "scene", "ball": {"type": "sphere"}}
+        nodes = {"type": "scene", "ball": {"type": "sphere"}}
         if int(self.plugin.flags()) & int(mi.EmitterFlags.Surface):
             place = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 180)
             nodes["square"] = {"type": "rectangle", "to_world": place, "light": self.plugin}
@@ -211,8 +212,8 @@ def sampling(law: Law, case: Case) -> None:
     if not s.lit.any():
         raise Skip("no sample carries light")
     points = case.points.astype(np.float64)
-    scale = np.abs(s.dist) + np.abs(points).max(axis=1)
-    off = np.linalg.norm(s.p - points - s.dist[:, None] * s.d, axis=1)
+    scale = abs(s.dist) + abs(points).max(axis=1)
+    off = norm(s.p - points - s.dist[:, None] * s.d, axis=1)
     law.hold("place", np.nan_to_num((off / scale)[s.lit]))
     if not case.around:
         law.notes.append("directions to surfaces are judged with their shapes")
@@ -310,7 +311,7 @@ def finite(law: Law, case: Case) -> None:
     """All numbers of samples are finite, directions one unit long, weights and densities not negative."""
     s = case.samples
     sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
-    length = np.abs(np.linalg.norm(s.d.astype(np.float64), axis=1) - 1)
+    length = abs(norm(s.d.astype(np.float64), axis=1) - 1)
     usable = (length <= LENGTH) & np.isfinite(s.dist) & (s.pdf >= 0)
     law.hold("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable))
     if not probe.is_scalar():

@@ -193,7 +193,7 @@ def _summary(errors: Array, statistic: str | float) -> tuple[float, int]:
     """The statistic of N errors, and the index of the error that shows it best."""
     if isinstance(statistic, float):
         quantile = np.nanquantile(errors, statistic)
-        return quantile, int(np.nanargmin(np.abs(errors - quantile)))
+        return quantile, int(np.nanargmin(abs(errors - quantile)))
     worst = int(np.where(np.isnan(errors), np.inf, errors).argmax())
     if statistic == "count":
         return errors.sum(), worst
@@ -305,7 +305,7 @@ class Subject:
     def scene(self, **changes: Any) -> mi.Scene:
         """Load a scene that holds the shape alone, or an instance with its group. Raises ``Skip`` as well."""
         given = self.with_(**changes)
-        nodes: Description = {"shape": given}
+        nodes = {"shape": given}
         for key, value in given.items():
             if given["type"] == "instance" and isinstance(value, dict) and value["type"] == "shapegroup":
                 nodes = {"group": value, "shape": {**given, key: {"type": "ref", "id": "group"}}}
@@ -490,7 +490,7 @@ def examine(
     variant = mi.variant()
     with settings_restored():
         case = kind(given, quick, seed)
-    checked: dict[str, Law] = {}
+    checked = {}
     obstacle = case.unsupported  # why the laws that are left cannot be judged
     for name in laws:
         if name in chosen:

@@ -45,7 +45,7 @@ def ecnoise(lines: Array, *, coarse: bool = False) -> Array:
         levels.append(np.sqrt(gamma * (table**2).mean(axis=0)))
         signs.append((table.min(axis=0) < 0) & (table.max(axis=0) > 0))
     level = np.array(levels)
-    change = np.ptp(lines, axis=0) / np.abs(lines).max(axis=0)
+    change = np.ptp(lines, axis=0) / abs(lines).max(axis=0)
     if coarse:
         return np.where(change > 0.5, 0, level[2:].min(axis=0))
     noise = np.where(change > STEEP, np.nan, level[:-2].min(axis=0))
@@ -105,7 +105,7 @@ def measure(
     line = np.take_along_axis(lines, chosen[None, None], axis=0)[0]
     slope = _slope(values, inputs.shape)
     explained = np.sqrt((slope**2).sum(axis=0) / 12)  # a rounded input is within half a step: variance 1/12
-    unit = ROUNDING * np.abs(line[0] if size is None else size)
+    unit = ROUNDING * abs(line[0] if size is None else size)
     noise = ecnoise(line)
     if project:
         stairs = np.array([ecnoise(line, coarse=True) for line in values(along(COARSE), project)])
@@ -127,5 +127,5 @@ def _slope(values: Callable[[Array], Array], shape: tuple[int, ...]) -> Array:
     forth, back = np.moveaxis(values(steps), 1, 0)
     slope = (forth - back) / (2 * reaches[..., 0, 0])
     # of several widths, the one that agrees best with its neighbour
-    best = np.abs(np.diff(slope, axis=0)).argmin(axis=0)[None]
+    best = abs(np.diff(slope, axis=0)).argmin(axis=0)[None]
     return np.take_along_axis(slope[1:], best, axis=0)[0]

@@ -217,7 +217,7 @@ def spread(
     largest = np.zeros_like(base)
     for _ in range(6):
         moved = [v + by * rng.normal(size=v.shape).astype(np.float32) for v in directions]
-        change = np.abs(quantity(*moved) - base)
+        change = abs(quantity(*moved) - base)
         largest = np.maximum(largest, np.where(np.isnan(change), np.inf, change))
     return largest
 
@@ -230,7 +230,7 @@ def excess(one: Array, other: Array, allowed: Array | float = 0.0) -> Array:
     """
     allowed = np.broadcast_to(allowed, one.shape)
     one, other, allowed = (np.reshape(x, (len(one), -1)).astype(np.float64) for x in (one, other, allowed))
-    size = np.maximum(np.abs(one), np.abs(other)).max(axis=1, keepdims=True)
+    size = np.maximum(abs(one), abs(other)).max(axis=1, keepdims=True)
     size = np.where(size > 1e-20, size, np.inf)
-    beyond = np.maximum(np.abs(one - other) - 8 * allowed, 0) / size
+    beyond = np.maximum(abs(one - other) - 8 * allowed, 0) / size
     return np.where(np.isfinite(beyond), beyond, 0).max(axis=1)

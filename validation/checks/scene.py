@@ -94,7 +94,7 @@ def check_scene(
     runtime.use()
     source = open_scene(scene, **options)
     kinds = _plugins(source.scene)
-    checks: dict[str, Check] = {}
+    checks = {}
     left_out = []
     chosen = [(kind, i) for kind, alike in kinds.items() for i in _spread_over(len(alike))]
     with (progress or Progress()).stage("Laws", len(chosen)) as advance:

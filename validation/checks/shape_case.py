@@ -8,6 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from numpy.linalg import norm
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import law as laws
@@ -56,7 +57,7 @@ def trace(target: mi.Scene, o: Array, d: Array) -> Lanes:
     columns = lanes(call, ("Point3f", o), ("Vector3f", d))
     hits = Lanes(o=o, d=d, **dict(zip(names, columns, strict=True)))
     hits.cos = dot(hits.n, d)
-    hits.steep = hits.met & (np.abs(hits.cos) > FLAT)
+    hits.steep = hits.met & (abs(hits.cos) > FLAT)
     return hits
 
 
@@ -110,7 +111,7 @@ class Case(Subject):
         self.low = self.points.min(axis=0)  # the box itself may be wrong
         self.high = self.points.max(axis=0)
         self.middle = (self.low + self.high) / 2
-        self.size = float(np.linalg.norm(self.high - self.low))
+        self.size = float(norm(self.high - self.low))
 
     def around(self, count: int) -> Array:
         """Points that look at the shape, from 1.5 sizes away. [count, 3]"""
@@ -171,7 +172,7 @@ class Case(Subject):
         even = np.ones(len(clear), bool)
         last = np.full((len(clear), 3), np.inf)
         for line, hits in self.crossings:
-            clear[line] &= (np.abs(hits.cos) > 4 * FLAT) & ~near(hits.p, last[line])
+            clear[line] &= (abs(hits.cos) > 4 * FLAT) & ~near(hits.p, last[line])
             even[line] ^= True
             last[line] = hits.p
         return clear, even
@@ -190,12 +191,12 @@ def _refused(shape: mi.Shape) -> str:
 
 def offset(p: Array) -> Array:
     """How far off the surface ``spawn_ray`` starts from points [N, 3]."""
-    return OFFSET * (1 + np.abs(p).max(axis=1))
+    return OFFSET * (1 + abs(p).max(axis=1))
 
 
 def near(p: Array, q: Array) -> Array:
     """Whether points [N, 3] are one, for all that a spawned ray can tell. [N]"""
-    return np.linalg.norm(p - q, axis=1) < 4 * offset(p)
+    return norm(p - q, axis=1) < 4 * offset(p)
 
 
 def leave(hits: Lanes, d: Array) -> Array:

@@ -7,6 +7,7 @@ from contextlib import suppress
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.linalg import norm
 from scipy import stats
 
 from mrt_mitsuba.validation.checks import law as laws
@@ -132,15 +133,15 @@ def _answers(law: Law, case: Case, rays: str, seen: Lanes, reach: float) -> None
 def surface(law: Law, case: Case) -> None:
     """p = o + t d is on the surface; spawned rays do not meet it where they start; digits are kept."""
     met = case.met
-    numbers = np.abs(np.concatenate([met.o, met.p], axis=1))
+    numbers = abs(np.concatenate([met.o, met.p], axis=1))
     along = met.o.astype(np.float64) + met.t[:, None] * met.d
-    off = np.abs(along - met.p).max(axis=1)
+    off = abs(along - met.p).max(axis=1)
     law.hold("on_ray", off / (ROUNDING * (numbers.max(axis=1) + met.t)), met)
     _from_near_by(law, case)
     _again(law, case)
     step = 1e-3 * case.size
     again = trace(case.target, np.float32(met.p - step * met.d), met.d)
-    missed = ~again.met | (np.linalg.norm(again.p - met.p, axis=1) >= step)
+    missed = ~again.met | (norm(again.p - met.p, axis=1) >= step)
     law.hold("missed", missed, again)
     _noise(law, case)
 
@@ -152,15 +153,15 @@ def _again(law: Law, case: Case) -> None:
     away = case.units(count)
     again = trace(case.target, leave(few, away), away)
     # another part may truly be that near, in a hollow edge
-    alike = np.abs(dot(again.n, few.n)) > np.where(again.part == few.part, 0.9, 0.9999)
-    bad = again.met & near(few.p, again.p) & alike & (np.abs(dot(few.n, away)) > FLAT)
+    alike = abs(dot(again.n, few.n)) > np.where(again.part == few.part, 0.9, 0.9999)
+    bad = again.met & near(few.p, again.p) & alike & (abs(dot(few.n, away)) > FLAT)
     law.hold("again", bad, again, count=count)
 
 
 def _noise(law: Law, case: Case) -> None:
     """The noise of distance, hit point and normal."""
     met = case.met.only(slice(0, case.count(300, 1000)))
-    scale = np.abs(met.o).max(axis=1) + met.t
+    scale = abs(met.o).max(axis=1) + met.t
     inputs = np.concatenate([met.o, met.d], axis=1)
 
     def hits(x: Array) -> Lanes:
@@ -191,12 +192,12 @@ def _from_near_by(law: Law, case: Case) -> None:
     reach = 0.05 * case.size
     again = trace(case.target, np.float32(met.p - reach * d), d)
     same = again.met & near(met.p, again.p)
-    largest = np.abs(met.p).max(axis=1) + reach
+    largest = abs(met.p).max(axis=1) + reach
     along = again.o + again.t[:, None].astype(np.float64) * d
-    off = np.abs(along - again.p).max(axis=1)
+    off = abs(along - again.p).max(axis=1)
     # the same line the other way around, from as far behind
     back = trace(case.target, np.float32(met.p + reach * d), -d)
-    apart = np.linalg.norm(back.p.astype(np.float64) - again.p, axis=1) * np.abs(dot(met.n, d))
+    apart = norm(back.p.astype(np.float64) - again.p, axis=1) * abs(dot(met.n, d))
     alike = same & back.met & (back.part == met.part) & (apart < 0.01 * case.size)
     alike &= case.behind.met.mean() > 0.5  # else rays pass it from behind
     for name, error, known in (("near_by", off, same), ("behind", apart, alike)):
@@ -258,19 +259,19 @@ def normals(law: Law, case: Case) -> None:
     else:
         law.notes.append("open: there is no outside for normals to point to")
     met = case.met
-    length = np.linalg.norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1)
-    law.hold("length", np.abs(length - 1).max(axis=0), met)
+    length = norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1)
+    law.hold("length", abs(length - 1).max(axis=0), met)
     law.hold("side", dot(met.n, met.shading) <= 0, met)
     smoothed = isinstance(case.plugin, mi.Mesh) and case.plugin.has_vertex_normals()
     if not smoothed and laws.class_name(case.plugin) not in SMOOTHED:
-        law.hold("shading", np.linalg.norm(met.shading - met.n, axis=1), met)
+        law.hold("shading", norm(met.shading - met.n, axis=1), met)
     # the normal is the surface's, not the ray's: the same for a ray that comes back from behind
     back = case.behind
     same = back.met & near(met.p, back.p) & (back.part == met.part)
     if same.sum() > 20:
         law.hold("turned", same & (dot(back.n, met.n) < -0.5), met)
     along = unit(np.stack([met.du, met.dv]))  # NaN where the derivative is 0
-    slant = np.abs(dot(along, met.n)).max(axis=0)
+    slant = abs(dot(along, met.n)).max(axis=0)
     if np.isfinite(slant).any():
         law.hold("slant", np.where(np.isfinite(slant), slant, 0), met)
     _differences(law, case)
@@ -285,12 +286,12 @@ def _differences(law: Law, case: Case) -> None:
     for h in (2e-3, 1e-3):
         other = trace(case.target, np.float32(met.o + h * case.size * aside), met.d)
         step = (other.p - met.p).astype(np.float64)
-        length = np.linalg.norm(step, axis=1)
+        length = norm(step, axis=1)
         ok = other.met & (other.part == met.part) & (dot(other.n, met.n) > 0.9)
         ok &= (length < 40 * h * case.size) & (length > 0)
         du, dv = (other.uv - met.uv).T[:, :, None].astype(np.float64)
-        slopes.append(np.where(ok, np.abs(dot(step, met.n)) / length, np.nan))
-        off = np.linalg.norm(step - du * met.du - dv * met.dv, axis=1) / length
+        slopes.append(np.where(ok, abs(dot(step, met.n)) / length, np.nan))
+        off = norm(step - du * met.du - dv * met.dv, axis=1) / length
         ok &= (np.abs([du, dv]).max(axis=(0, 2)) < 0.2) & met.du.any()
         partials.append(np.where(ok, off, np.nan))
     for name, (wide, narrow) in (("slope", slopes), ("step", partials)):
@@ -319,7 +320,7 @@ def watertight(law: Law, case: Case) -> None:
     """Lines enter and leave in turn, and no ray from inside gets out without a hit."""
     met = case.met
     # else such a ray may fall off an edge, or its offset be larger than the shape
-    steep = (np.abs(met.cos) > 0.5) & (offset(met.p) < 1e-3 * case.size)
+    steep = (abs(met.cos) > 0.5) & (offset(met.p) < 1e-3 * case.size)
     blind = steep & ~case.behind.met
     if blind.mean() > 1e-2:
         law.hold("blind", blind, met)
@@ -348,7 +349,7 @@ def _inside(case: Case) -> Array:
     _, i, j = np.intersect1d(first, second, return_indices=True)
     entry = entries.p[i]
     exit_ = exits.p[j]
-    chord = np.linalg.norm(entry - exit_, axis=1)
+    chord = norm(entry - exit_, axis=1)
     return ((entry + exit_) / 2)[chord >= np.median(chord)].astype(np.float32)
 
 
@@ -384,12 +385,12 @@ def scale(law: Law, case: Case) -> None:
             low, high = corners(case.load(to_world=to_world))
         except RuntimeError as problem:
             raise Skip("to_world is not accepted") from problem
-        grown = np.linalg.norm(high - low)
+        grown = norm(high - low)
         if not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
             raise Skip("to_world does not scale all of it (of curves, the radius stays)")
         there = trace(case.scene(to_world=to_world), np.float32(seen.o * 2.0**power), seen.d)
         both = seen.steep & there.met
-        apart = np.abs(there.t / 2.0**power - seen.t) / np.where(both, seen.t, 1)
+        apart = abs(there.t / 2.0**power - seen.t) / np.where(both, seen.t, 1)
         error = np.where(both, np.maximum(apart, 1 - dot(there.n, seen.n)), 0)
         otherwise = (~seen.met | seen.steep) & (there.met != seen.met)
         for name, errors in (("answer", otherwise), ("off", error)):
@@ -421,12 +422,12 @@ def far(law: Law, case: Case) -> None:
     there = trace(case.target, np.float32(goal - distance * exactly), d)
     closer = np.float32(there.o + (FAR - 1.5) * case.size * exactly)
     here = trace(case.target, closer, d)
-    cos = np.abs(here.cos)
-    apart = np.linalg.norm(there.p.astype(np.float64) - here.p, axis=1)
+    cos = abs(here.cos)
+    apart = norm(there.p.astype(np.float64) - here.p, axis=1)
     error = apart * cos / (ROUNDING * distance)
     bad = here.met & (cos > 4 * FLAT) & (~there.met | (error > HIT_ROUNDINGS))
     # a rounded origin moves the line: only what all lines around it meet counts
-    bad &= np.linalg.norm(here.p - goal, axis=1) < 20 * ROUNDING * distance
+    bad &= norm(here.p - goal, axis=1) < 20 * ROUNDING * distance
     across = unit(np.cross(d, case.units(len(d))))
     for side in (across, -across, np.cross(d, across), np.cross(across, d)):
         aside = trace(case.target, np.float32(closer + 4 * ROUNDING * distance * side), d)
@@ -461,7 +462,7 @@ def finite(law: Law, case: Case) -> None:
     d = unit(d + np.where((d == 0).all(axis=1, keepdims=True), [0, 0, 1], 0))
     d[(d == 0) & (rng.random(d.shape) < 0.3)] = 1e-30
     to_middle = case.middle - o
-    towards = unit(np.where(np.abs(to_middle) > 0, to_middle, 1))
+    towards = unit(np.where(abs(to_middle) > 0, to_middle, 1))
     d = np.where(rng.random((count, 1)) < 0.3, towards, d)
     hits = trace(case.target, o, d)
     vectors = (hits.p, hits.n, hits.shading, hits.uv, hits.du, hits.dv)
@@ -523,5 +524,5 @@ def variants(law: Law, case: Case) -> None:
     seen = case.seen.only(slice(0, case.count(500, 2000)))
     there = case.elsewhere(other, lambda: trace(case.scene(), seen.o, seen.d))
     law.hold("answer", (there.met != seen.met) & (seen.steep | ~seen.met), seen, other=other)
-    error = np.abs(there.t - seen.t) / (ROUNDING * (np.abs(seen.o).max(axis=1) + seen.t))
+    error = abs(there.t - seen.t) / (ROUNDING * (abs(seen.o).max(axis=1) + seen.t))
     law.hold("distance", np.where(there.met & seen.steep, error, 0), seen, other=other)

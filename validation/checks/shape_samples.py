@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.linalg import norm
 from scipy import stats
 
 from mrt_mitsuba.validation.checks.law import SIGMAS, Figure, Law, at_most, figures, most, rare, share_of
@@ -95,7 +96,7 @@ def sampling(law: Law, case: Case) -> None:
     E[1 / pdf] is the area, and of directions the solid angle of what is seen.
     """
     (p, n, pdf, again), u, area = case.positions
-    law.hold("position", np.abs(pdf / again - 1))
+    law.hold("position", abs(pdf / again - 1))
     law.hold("area", abs(np.mean(1 / pdf) / area - 1))
     few = slice(0, case.count(2**14, 2**17))
     # sampled positions, and their normals, as rays meet them
@@ -103,12 +104,12 @@ def sampling(law: Law, case: Case) -> None:
     inwards = -n[few]
     back = trace(case.target, start, unit(inwards))
     # another part of the surface may be nearer than a hundredth of the size
-    away = np.where(back.met, np.linalg.norm(back.p - p[few], axis=1), np.inf)
-    scale = np.abs(p[few]).max(axis=1) + 0.01 * case.size
+    away = np.where(back.met, norm(back.p - p[few], axis=1), np.inf)
+    scale = abs(p[few]).max(axis=1) + 0.01 * case.size
     law.hold("off", away / (ROUNDING * scale), back)
     if back.met.any():
         cosine = np.minimum(dot(-inwards, back.shading), dot(-inwards, back.n))
-        cosine = cosine / np.linalg.norm(inwards, axis=1)
+        cosine = cosine / norm(inwards, axis=1)
         off = np.where(back.met, 1 - cosine, np.nan)
         law.hold("normal", off, back)
     if case.behind.met.mean() > 0.5:
@@ -136,7 +137,7 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     estimate = 2 * np.pi * radius**2 * crossed.mean()
     error = 2 * np.pi * radius**2 * crossed.std() / np.sqrt(count)
     beyond = max(abs(estimate - area) - SIGMAS * error, 0)
-    room = 3e-3 + 20 * offset(p).max() / case.size + twice
+    room = 3e-3 + 20 * float(offset(p).max()) / case.size + twice
     law.hold("crossings", beyond / area, limit=room)
     if twice > ROOM:
         law.notes.append("parts of it coincide: where positions lie is not judged")
@@ -192,7 +193,7 @@ def _distance(x: Array, y: Array, weight: Array | None = None) -> float:
     below = np.concatenate([[0], np.cumsum(weight[order])]) / weight.sum()
     y = np.sort(y)
     here = below[np.searchsorted(x[order], y, side="right")]
-    return np.abs(here - np.arange(1, len(y) + 1) / len(y)).max()
+    return float(abs(here - np.arange(1, len(y) + 1) / len(y)).max())
 
 
 def _chance(apart: Sequence[float], size: float) -> float:
@@ -211,7 +212,7 @@ def _directions(law: Law, case: Case, u: Array) -> None:
         return
     drawn = pdf > 0
     met = trace(case.target, o, np.float32(d))
-    law.hold("direction", np.where(drawn, np.abs(pdf / again - 1), 0), met)
+    law.hold("direction", np.where(drawn, abs(pdf / again - 1), 0), met)
     before_it = met.steep & (met.t > dist * (1 + 1e-3))
     law.hold("misses", drawn & np.where(met.met, before_it, True), met)
     mean, variance = _moments(case, met, _visible(dist, pdf, met))
@@ -219,7 +220,7 @@ def _directions(law: Law, case: Case, u: Array) -> None:
     o = case.around(case.count(2**17, 2**19))
     met = trace(case.target, o, _into_cone(case, o, case.rng))
     expected, other = _moments(case, met, np.where(met.met, CONE, 0))
-    off = np.abs(mean - expected) - SIGMAS * np.sqrt(variance + other)
+    off = abs(mean - expected) - SIGMAS * np.sqrt(variance + other)
     law.hold("angle", max(off.max(), 0) / expected[0])
     if len(u) >= 2**12:
         law.hold("aim", _aim(case, case.count(2**15, 2**17)))

@@ -27,7 +27,7 @@ _SPREAD = np.sum([(np.arange(2**DEPTH) >> k & 1) << 2 * k for k in range(DEPTH)]
 def encode(wo: Array) -> Array:
     """Morton codes [N] of directions [N, 3]."""
     x, y, z = wo.T.astype(np.float64)
-    r = np.sqrt((x * x + y * y) / (1 + np.abs(z)))
+    r = np.sqrt((x * x + y * y) / (1 + abs(z)))
     turn = np.arctan2(y, x) / (2 * np.pi) + 0.5
     return (z < 0) * HEMISPHERE + (_bits(r) | (_bits(turn) << 1))
 
@@ -132,7 +132,7 @@ class Cells(Lanes):
         ``variance``: of ``expected``; ``known``: to how much densities are known, relative.
         """
         chances = chances_of(seen, expected, variance, known)
-        return sidak(chances.min(), 2 * len(chances)), chances.argmin()
+        return sidak(chances.min(), 2 * len(chances)), int(chances.argmin())
 
     def rarest_slice(self, seen: Array, expected: Array, variance: Array, known: float) -> float:
         """The same for rows of cells of one r or azimuth, and slices along x and y."""
@@ -200,9 +200,9 @@ def integrate(
         values = values.reshape(*omega.shape, -1) * omega[..., None] * POINTS
         mean = values.mean(axis=1)
         variance = values.var(axis=1) / (POINTS - 1)
-        total = np.abs(mean).sum(axis=0) + 1e-12
+        total = abs(mean).sum(axis=0) + 1e-12
         # half of what chance does to the count of the samples, or one sample, is known well enough
-        enough = 0.25 * np.abs(mean) / total / samples + 1 / samples**2
+        enough = 0.25 * abs(mean) / total / samples + 1 / samples**2
         bad = (variance / total**2 > enough).any(axis=1)
         bad |= (by_samples * samples > 1.5) & (mean[:, 0] < 0.2 * by_samples)
         bad &= (cells.level < DEPTH) & (attempt < ATTEMPTS - 1)
@@ -242,5 +242,5 @@ def chi_square(
         used = (seen_in > 0) | (expected_in > 1e-6)
         pull = (seen_in - expected_in)[used] ** 2 / np.maximum(variance_in, 1e-6)[used]
         tests.append((pull.sum(), max(len(pull), 1)))
-    worst = np.abs(seen - expected) / np.sqrt(expected + variance + 1)
+    worst = abs(seen - expected) / np.sqrt(expected + variance + 1)
     return np.array(tests), integrals.bounds(worst.argmax())

@@ -25,7 +25,7 @@ def luma_edges(image: Array) -> Edges:
     largest = maximum_filter(luma, 3)
     contrast = largest - minimum_filter(luma, 3) + 0.05
     threshold = np.maximum(0.0312, 0.125 * largest)
-    return _inside(~(contrast < threshold), contrast, np.abs(contrast - threshold))
+    return _inside(~(contrast < threshold), contrast, abs(contrast - threshold))
 
 
 def sobel_edges(image: Array) -> Edges:
@@ -36,14 +36,14 @@ def sobel_edges(image: Array) -> Edges:
     """
     red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
     exact = 255 * (0.07 * red + 0.72 * green + 0.21 * blue)
-    from_whole = np.where(np.abs(exact) < 0.5, 1.0, np.abs(exact - np.round(exact)))
-    gradient = sum(np.abs(sobel(np.trunc(exact), axis)) for axis in (0, 1))
+    from_whole = np.where(abs(exact) < 0.5, 1.0, abs(exact - np.round(exact)))
+    gradient = sum(abs(sobel(np.trunc(exact), axis)) for axis in (0, 1))
     return _inside(gradient > 0, gradient, minimum_filter(from_whole, 3))
 
 
 def blur_amount(depth: Array, focal_distance: float, focal_range: float) -> Array:
     """The height map: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``, and 8 for a miss."""
-    amount = np.clip(np.abs(focal_distance - depth.astype(np.float64)) - focal_range, 0, 8)
+    amount = np.clip(abs(focal_distance - depth.astype(np.float64)) - focal_range, 0, 8)
     return np.where((depth <= 0) | np.isinf(depth), 8, amount)
 
 
@@ -87,14 +87,14 @@ def corrected_dof(image: Array, radius: Array) -> Array:
 
     for dx, dy in steps:
         there = padded[5 + dy : 5 + dy + len(radius), 5 + dx : 5 + dx + radius.shape[1]]
-        theirs = np.abs(there[..., 4])
+        theirs = abs(there[..., 4])
         light = there[..., :4]
         order = there[..., 4] - radius
-        own_disc = disc(np.abs(radius), dx, dy)
+        own_disc = disc(abs(radius), dx, dy)
         their_disc = disc(theirs, dx, dy)
         parts = np.minimum(-order, 1), 1 - abs(order), np.minimum(order, 1)
         nearer, level, farther = (np.maximum(part, 0)[..., None] for part in parts)
-        wider_behind = ((order > 0) & (theirs > np.abs(radius)))[..., None]
+        wider_behind = ((order > 0) & (theirs > abs(radius)))[..., None]
         front += nearer * their_disc * light
         same += level * np.where(wider_behind, own_disc, their_disc) * light
         behind += farther * own_disc * light

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.linalg import norm
 from PIL import Image
 
 from mrt_mitsuba.errors import SceneError
@@ -91,7 +92,7 @@ def _radiance(
     numbers = np.array([(m.material.ior, m.material.alpha, *m.material.specular) for m in things])
     light = np.zeros(d.shape)
     path, lights = np.zeros((2, len(d)), np.uint64)
-    rays: list[Array] = [np.arange(len(d)), np.ones(d.shape), np.zeros(len(d), int), o, d]
+    rays = [np.arange(len(d)), np.ones(d.shape), np.zeros(len(d), int), o, d]
     while len(rays[0]):
         ray, weight, spent, o, d = rays
         t, thing, n, diffuse = nearest(things, o, d)
@@ -103,7 +104,7 @@ def _radiance(
         p = o + t[:, None] * d
         cos = -dot(n, d)
         specular = np.transpose(specular)
-        start = p + (OFFSET * (np.abs(o).max(axis=1) + t))[:, None] * n
+        start = p + (OFFSET * (abs(o).max(axis=1) + t))[:, None] * n
 
         seen = np.zeros(len(ray), int)
         for lamp in scene.lights:
@@ -111,7 +112,7 @@ def _radiance(
             way = lamp.position - start
             facing = np.flatnonzero((dot(n, to_light) > 0) & (cos > 0))
             shadow = unit(way[facing])
-            reach = np.linalg.norm(way[facing], axis=1)
+            reach = norm(way[facing], axis=1)
             lit = facing[nearest(things, start[facing], shadow, reach)[1] < 0]
             seen *= 3
             seen[facing] += 1
@@ -139,7 +140,7 @@ def _mix(hashed: Array, value: Array) -> Array:
 
 def unit(v: Any) -> Array:
     """Vectors [..., 3] made one unit long."""
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+    return np.asarray(v / norm(v, axis=-1, keepdims=True))
 
 
 def dot(a: Array, b: Array) -> Array:
@@ -170,7 +171,7 @@ def specular_lobe(n: Array, to_light: Array, to_eye: Array, alpha: Array) -> Arr
     sin2 = np.square(np.cross(n, h)).sum(axis=-1)
     lobe = np.exp(-sin2 / cos2 / alpha**2) / (math.pi * alpha**2 * cos2**2)
     for way in (to_light, to_eye):
-        a = np.minimum(dot(n, way) / (alpha * np.linalg.norm(np.cross(n, way), axis=-1)), 1.6)
+        a = np.minimum(dot(n, way) / (alpha * norm(np.cross(n, way), axis=-1)), 1.6)
         fit = a * (3.535 + 2.181 * a) / (1 + a * (2.276 + 2.577 * a))
         lobe = lobe * np.where(a < 1.6, fit, 1.0)
     return lobe / (4 * dot(n, to_light) * dot(n, to_eye))
@@ -227,7 +228,7 @@ def _axial(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
     ``start + slope height``."""
     cone = isinstance(thing, Cone)
     first, other = (thing.apex, thing.base_center) if isinstance(thing, Cone) else (thing.p0, thing.p1)
-    length = np.linalg.norm(np.subtract(other, first))
+    length = norm(np.subtract(other, first))
     axis = np.subtract(other, first) / length
     start = 0.0 if cone else thing.radius
     slope = (thing.radius - start) / length
@@ -248,7 +249,7 @@ def _axial(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
     h = height + side * rise
     side[~((h >= 0) & (h <= length))] = np.inf
     discs = np.stack([(length - height) / rise, -height / rise])
-    discs[np.linalg.norm(across + discs[..., None] * drift, axis=-1) > thing.radius] = np.inf
+    discs[norm(across + discs[..., None] * drift, axis=-1) > thing.radius] = np.inf
     parts = _ahead(passed + np.concatenate([side, discs[: 2 - cone]]))
     part = parts.argmin(axis=0)
     t = parts.min(axis=0)

@@ -187,7 +187,7 @@ def _scene(number: Number, size: tuple[int, int], **options: Any) -> Options:
     width, height = size
     if isinstance(number, int):
         return mrt.scene_dict(number, width=width, height=height, **options)
-    box: Options = mi.cornell_box()
+    box = mi.cornell_box()
     box["sensor"]["film"] |= {"width": height, "height": height}
     return box
 

@@ -62,7 +62,7 @@ def noise(study: Study, *, quick: bool) -> None:
     contrast = np.ptp(np.lib.stride_tricks.sliding_window_view(luma, (3, 3)), axis=(2, 3))
     flat = contrast < FLAT
     edge = contrast > EDGE
-    rows: list[Values] = []
+    rows = []
     for detector, find in (("luma", filters.luma_edges), ("sobel", filters.sobel_edges)):
         for spp in counts:
             refined = mrt.render(scene, aa=2, aamode=detector, lattice="report", spp=spp).layers["samples.Y"]

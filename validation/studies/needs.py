@@ -7,7 +7,7 @@ with that and as many rays in every pixel as edges get.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -76,12 +76,12 @@ def measure(number: int, size: tuple[int, int], repeats: int) -> tuple[Figures, 
     """The figures of each way to render a scene, with edges refined, and a result as planned."""
     planned, whole = scenes_of(number, size)
     general_way = REFINED | {"layers": "all"}
-    renders: dict[str, Callable[..., Result]] = {
+    renders = {
         PLANNED: partial(mrt.render, planned, **REFINED),
         GENERAL: partial(mrt.render, whole, **general_way),
         EVERYTHING: partial(mrt.render, whole, **general_way | {"aamode": "none"}),
     }
-    figures: Figures = {}
+    figures = {}
     for way, render in renders.items():
         counted = render(count_rays=True)
         figures[way] = {
@@ -107,8 +107,8 @@ def run(study: Study, *, quick: bool) -> None:
 
 def show(study: Study, size: tuple[int, int], scenes: Sequence[int], repeats: int) -> None:
     """Add the bars and the table of scenes to a study."""
-    found: dict[int, Figures] = {}
-    rows: list[Values] = []
+    found = {}
+    rows = []
     for number in study.each(TITLE, scenes):
         found[number], result = measure(number, size, repeats)
         planned = found[number][PLANNED]

@@ -80,7 +80,7 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> dict[str, f
 
 def pointwise(study: Study, *, quick: bool) -> None:
     """Compare values and densities, over roughness and in every variant that can run here."""
-    rows: list[Values] = []
+    rows = []
     before = runtime.use()
     variants = runtime.usable_variants()
     if quick:  # every colour mode once, and one scalar variant
@@ -165,7 +165,7 @@ def compare_roughconductor(
     # edge goes on differently; anything else would show in most pixels of the ball
     plain = (ball_scene(bsdf(alpha, visible=False), size=size) for bsdf in (ours, theirs))
     one, other = (np.array(mi.render(scene, spp=16, seed=1)) for scene in plain)
-    differ = (np.abs(one - other) > 1e-4 * np.maximum(other, other.mean())).any(axis=-1)
+    differ = (abs(one - other) > 1e-4 * np.maximum(other, other.mean())).any(axis=-1)
     errors = {
         **compare_pointwise(alpha, count=pairs),
         RELATIVE: compare(first, second).rel_mse ** 0.5,
@@ -191,7 +191,7 @@ def rendered(study: Study, *, quick: bool) -> None:
         why = "pixels, tiles and the picture"
         study.at_least(what, found.errors[P_VALUE], LEVEL, why)
         one, other, difference = found.images.values()
-        sheet = np.concatenate([one, other, 20 * np.abs(difference)], axis=1)
+        sheet = np.concatenate([one, other, 20 * abs(difference)], axis=1)
         caption = f"{found.samples} samples per pixel each, independent: the difference is noise, relRMSE "
         caption += f"{found.errors[RELATIVE]:.2g}. Time, ours over theirs: {found.timings['ratio']:.2f}."
         study.picture(f"pictures-{alpha:g}", f"Ours, Mitsuba's, |difference| × 20; {at}", sheet, caption)

@@ -88,7 +88,7 @@ def judge(
     """
     settings |= {"height": image.shape[0], "width": image.shape[1]}
     truth = reference_render(scene, **settings)
-    error = np.abs(image - truth.image).max(axis=-1)
+    error = abs(image - truth.image).max(axis=-1)
     off = ~(error <= STEP)
     if not off.any():
         return error, np.full(off.shape, -1)
@@ -96,14 +96,14 @@ def judge(
     moved = [reference_render(scene, displacement=step, **settings) for step in steps]
     silhouette = np.any([other.path != truth.path for other in moved], axis=0)
     shadow = np.any([other.lights != truth.lights for other in moved], axis=0)
-    spread = np.max([np.abs(other.image - truth.image).max(axis=-1) for other in moved], axis=0)
+    spread = np.max([abs(other.image - truth.image).max(axis=-1) for other in moved], axis=0)
     return error, np.select([~off, silhouette, shadow, error <= spread], [-1, 0, 1, 2], 3)
 
 
 def draw(scene: Any, size: Any, *, fresnel: str = "dielectric", **integrator: Any) -> np.ndarray:
     """Our picture, one sample per pixel, with no path cut short."""
     settings = {"type": "mrt_whitted", "min_contribution": 0.0, **integrator}
-    options: Values = {"width": size[0], "height": size[1], "aa": 1, "aamode": "none", "focaldist": 0}
+    options = {"width": size[0], "height": size[1], "aa": 1, "aamode": "none", "focaldist": 0}
     return mrt.render(scene, **options, fresnel=fresnel, integrator=settings).image
 
 
@@ -125,7 +125,7 @@ def hold(study: Study, name: str, error: np.ndarray, reason: np.ndarray) -> Valu
 
 def run(study: Study, *, quick: bool) -> None:
     """Judge our pictures of all scenes, and the places of samples."""
-    rows: list[Values] = []
+    rows = []
     for name, case in study.each("Scenes in float64", CASES.items()):
         size = case.sizes[quick]
         image = draw(case.scene, size, fresnel=case.fresnel)
@@ -148,6 +148,6 @@ def lattices(study: Study) -> None:
         truth = np.mean([sample.image for sample in samples], axis=0)
         options: Values = {"aa": 2, "aamode": "none", "focaldist": 0, "fresnel": "dielectric"}
         image = mrt.render(scene, lattice=lattice, **options, **size).image
-        error = np.quantile(np.abs(image - truth).max(axis=-1), 0.99)
+        error = np.quantile(abs(image - truth).max(axis=-1), 0.99)
         why = "four times what was measured; least fault: samples in other places leave 0.07"
         study.at_most(f"four samples, lattice={lattice}: difference of 99 %", error, 5e-6, why)

@@ -152,10 +152,10 @@ def other_ways(extent: Extent) -> Iterator[Pair]:
 
     def other_hits(ours: Run, other: Run) -> float:
         depths = [np.nan_to_num(side().layers["depth.Z"], posinf=1e6) for side in (ours, other)]
-        return float(np.mean(np.abs(depths[0] - depths[1]) > 1e-3 * depths[1]))
+        return float(np.mean(abs(depths[0] - depths[1]) > 1e-3 * depths[1]))
 
     def off(ours: Run, other: Run) -> float:
-        return float(np.abs(ours().image - other().image).max())
+        return float(abs(ours().image - other().image).max())
 
     why = "grazing rays may go either way in float32. One object in a thousand lost shows"
     name = f"{extent.growth} spheres in our tree / in Mitsuba's"

@@ -54,7 +54,7 @@ def direct(study: Study, *, quick: bool) -> None:
             ours = mrt.render(loaded, integrator=whitted, **AT_CENTRES, layers=["depth"])
             theirs = mrt.render(loaded, integrator="direct", **AT_CENTRES).image
             near = ~(ours.layers["depth.Z"] > NEAR) | np.isinf(ours.layers["depth.Z"])
-            error = (np.abs(ours.image - theirs) / (1 + theirs)).max(axis=-1)[near]
+            error = (abs(ours.image - theirs) / (1 + theirs)).max(axis=-1)[near]
             lit = (theirs.max(axis=-1) > 0.05)[near]
             found.append((np.median(error), np.mean(error > 1e-5), lit.mean()))
         rows.append({"scene": number, **dict(zip(figures, np.max(found, axis=0).tolist(), strict=True))})
@@ -89,7 +89,7 @@ def gloss(study: Study, *, quick: bool) -> None:
 
     def hold(bound: Callable[..., None], alpha: float, limit: float, why: str) -> None:
         image = mrt.render(spheres(alpha), **AT_CENTRES, spp=spp, integrator=path).image
-        error = np.abs(image - mirror.image)[sphere].mean() / mirror.image[sphere].mean()
+        error = abs(image - mirror.image)[sphere].mean() / mirror.image[sphere].mean()
         bound(f"gloss of alpha {alpha:g} against the mirror term", error, limit, why)
 
     hold(study.at_least, 0.3, 0.05, "else there is nothing to compare")

@@ -56,14 +56,14 @@ def albedo(bsdf: Any, wi: Array, *, resolution: int = 700) -> Array:
     """
     middles = (np.arange(resolution) + 0.5) / resolution
     s = 2 * middles - 1
-    phi = np.arctan2(-wi[1], -wi[0]) + np.pi * s * np.abs(s)
+    phi = np.arctan2(-wi[1], -wi[0]) + np.pi * s * abs(s)
     value, _ = evaluate(bsdf, wi, direction(middles[:, None], phi).reshape(-1, 3))
     # dω = d cos dφ, dφ = 2π |s| ds, ds = 2 dv
-    weight = np.broadcast_to(4 * np.pi * np.abs(s), (resolution, resolution)).ravel() / resolution**2
+    weight = np.broadcast_to(4 * np.pi * abs(s), (resolution, resolution)).ravel() / resolution**2
     return (value.astype(np.float64) * weight[:, None]).sum(axis=0)
 
 
 def relative_error(found: Array, expected: Array) -> Array:
     """Return |found / expected − 1| where the expected value is above 1e-7 of the largest, else 0."""
     counts = expected > 1e-7 * expected.max()
-    return np.abs(np.where(counts, found, 1) / np.where(counts, expected, 1) - 1)
+    return abs(np.where(counts, found, 1) / np.where(counts, expected, 1) - 1)

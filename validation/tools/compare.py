@@ -85,7 +85,7 @@ class Difference:
         values = self.difference
         shown = values if values.shape[2] == 3 else np.repeat(values[..., :1], 3, axis=2)
         write_exr(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures().items()})
-        size = np.abs(values).max(axis=2)
+        size = abs(values).max(axis=2)
         scale = np.max(size, initial=0, where=np.isfinite(size)) or 1
         colors = colormaps["inferno"](np.minimum(size / scale, 1))
         write_png(f"{stem}.png", colors[..., :3].astype(np.float32))
@@ -121,7 +121,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
         raise UsageError(f"cannot compare the data windows {window} and {other}: they show other places")
     with np.errstate(all="ignore"):
         difference = np.where(first == second, 0, first - second)  # inf where both are
-        size = np.abs(difference)
+        size = abs(difference)
         square = difference**2
         relative = np.where(np.isinf(square), np.inf, square / (second**2 + EPSILON))
         psnr = 20 * np.log10(peak) - 10 * np.log10(square.mean())
@@ -199,7 +199,7 @@ def _p_value(sides: Sequence[Layer]) -> float | None:
     rounding = ROUNDING * (brightness + brightness.mean())
     difference = values[0] - values[1]
     difference -= np.clip(difference, -rounding, rounding)
-    pixels = exceedance(np.abs(difference) / np.sqrt(sum(variances) + rounding**2 + 1e-300))
+    pixels = exceedance(abs(difference) / np.sqrt(sum(variances) + rounding**2 + 1e-300))
     least = min(_p_of_means(difference) / 0.99, pixels / 0.01)
     return float(-np.expm1(np.log1p(-min(0.99 * least, 1 - 1e-15)) + np.log1p(-0.01 * least)))
 
@@ -263,12 +263,12 @@ def p_values(ours: ArrayLike, theirs: ArrayLike, *, tile: int = 16) -> dict[str,
         raise UsageError(f"renders of shape {shapes}: give two or more of each, [N, H, W, C], of one size")
     if not all(np.isfinite(s).all() for s in sides):
         raise UsageError("renders hold infinite or undefined values")
-    light = np.maximum(*(np.abs(s.mean(axis=0)) for s in sides))
+    light = np.maximum(*(abs(s.mean(axis=0)) for s in sides))
     sizes = {"pixel": 1, "tile": tile, "image": max(light.shape)}
     found = {}
     for name, size in sizes.items():
         floor = ROUNDING * cell_sums(light + light.mean(), size) + 1e-30
-        of_each: list[Any] = []  # mean, standard deviation, count
+        of_each = []  # mean, standard deviation, count
         for s in (cell_sums(side, size) for side in sides):
             of_each += [s.mean(axis=0), np.sqrt(s.var(axis=0, ddof=1) + len(s) / 2 * floor**2), len(s)]
         p = stats.ttest_ind_from_stats(*of_each, equal_var=False).pvalue

@@ -175,7 +175,7 @@ def _draw_curves(axes: Axes, found: Findings) -> None:
         notable = colors[name] != GREY
         places = np.array([(p.seconds, _shown_error(p, bottom)) for p in curve]).T  # [2, points]
         ends = np.array([(p.seconds_interval, p.rmse_interval) for p in curve]).transpose(1, 2, 0)
-        reach = np.abs(ends - places[:, None])  # [2, 2, points]
+        reach = abs(ends - places[:, None])  # [2, 2, points]
         axes.errorbar(
             places[0],
             places[1],
@@ -211,7 +211,7 @@ def _name_points(axes: Axes, best: Sequence[Point], bottom: float) -> None:
     for point in best:
         name = " ".join(word for word in point.name.split() if word not in point.family.split())
         place = axes.transData.transform((point.seconds, _shown_error(point, bottom)))
-        if name and all(np.abs((place - other) / (46, 13)).max() > 1 for other in taken):
+        if name and all(abs((place - other) / (46, 13)).max() > 1 for other in taken):
             taken.append(place)
             shift: dict[str, Any] = {"xytext": (-4, -5), "textcoords": "offset points"}
             at = (point.seconds, _shown_error(point, bottom))

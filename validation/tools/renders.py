@@ -114,8 +114,8 @@ def _with_update() -> Render:
 def _prepared() -> Render:
     """A prepared render, or in versions without ``prepare`` a render of a loaded scene."""
     scene = load(mrt.scene_dict(3, **SMALL))
-    prepare: Any = getattr(mrt, "prepare", lambda scene, **options: partial(mrt.render, scene, **options))
-    render: Render = prepare(scene, **ONE_RAY)
+    prepare = getattr(mrt, "prepare", lambda scene, **options: partial(mrt.render, scene, **options))
+    render = prepare(scene, **ONE_RAY)
     return render
 
 
@@ -126,7 +126,7 @@ def _by_mitsuba() -> Render:
 
 
 def _box(width: int, height: int) -> Nodes:
-    box: Nodes = mi.cornell_box()
+    box = mi.cornell_box()
     box["sensor"]["film"] |= {"width": width, "height": height, "rfilter": {"type": "box"}}
     return box
 

@@ -72,7 +72,7 @@ LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
 def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> Any:
     """A scene by name, at a size; ``film`` and further nodes replace its own."""
     nodes = SCENES[name]()
-    size: Node = {"width": width, "height": height}
+    size = {"width": width, "height": height}
     if name == "crop":
         window = {"crop_offset_x": width // 4, "crop_offset_y": height // 4}
         window |= {f"crop_{side}": pixels for side, pixels in size.items()}
@@ -152,7 +152,7 @@ def envmap() -> Node:
 @scene
 def instances() -> Node:
     """Nine balls that are one, in three rows."""
-    group: Node = {"type": "ref", "id": "group"}
+    group = {"type": "ref", "id": "group"}
     nodes = dict(
         sensor=sensor([0, 3, 6], [0, 0.5, 0], "box"),
         group={"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(0.7))},
@@ -216,7 +216,7 @@ def area_light() -> Node:
 
 @scene
 def spot() -> Node:
-    light: Node = {"type": "spot", "intensity": rgb((40, 36, 30)), "cutoff_angle": 25}
+    light = {"type": "spot", "intensity": rgb((40, 36, 30)), "cutoff_angle": 25}
     light["to_world"] = _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])
     return dict(
         sensor=sensor([0, 3, 6], [0, 0.5, 0], "tent"),

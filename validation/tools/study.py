@@ -203,7 +203,7 @@ def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> 
 
 def operations(render: Callable[..., Any]) -> list[int]:
     """The length of the code of each kernel of a ``mrt.render``, each counted once."""
-    lengths: dict[Any, int] = {}  # by the hash of the code
+    lengths = {}  # by the hash of the code
 
     class Watch(Progress):
         def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:

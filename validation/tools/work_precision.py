@@ -162,7 +162,7 @@ class Findings:
         for error in self.errors:
             low = sorted((p for p in self.points.values() if p.rmse <= error), key=lambda p: p.seconds)
             others = [point for point in low if point.family != low[0].family]
-            row: Values = {"to get to an error of": error, "use": "nothing comes so low"}
+            row = {"to get to an error of": error, "use": "nothing comes so low"}
             row |= {"seconds": None, "next best": None, "which takes": None}
             if low:
                 row |= {"use": low[0].name, "seconds": _shown(low[0].seconds, *low[0].seconds_interval)}
@@ -295,7 +295,7 @@ def error_vs_time(
 def _runner(scene: Any, shared: Options) -> Run:
     """A function that renders cases, each scene loaded once where it can be."""
     variant = runtime.use(shared.get("variant"))
-    loaded: dict[int, Any] = {}  # by the id of what a scene is loaded from, which the caller holds
+    loaded = {}  # by the id of what a scene is loaded from, which the caller holds
 
     def run(options: Options, seed: int) -> Result:
         given = {"scene": scene, "variant": variant, **shared, **options, "seed": seed}

@@ -39,7 +39,7 @@ def run(study: Study, *, quick: bool) -> None:
     curves.show(study, quick=quick)
     study.texts.append("The least fault that a case shows is as large as its limit; of counts, a single one.")
     for table, (title, cases, note) in study.each(TITLE, PARTS.items()):
-        rows: list[tuple[object, ...]] = []
+        rows = []
         for case in cases(quick):
             limit = "-"
             verdict = "cannot hold"

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
+from numpy.linalg import norm
 
 from mrt_mitsuba.plugins import fresnel
 from mrt_mitsuba.scene.model import Cone, Cylinder, Plane, Sphere
@@ -125,7 +126,7 @@ def _off(values: Mapping[str, object], truth: Array) -> Curves:
     """Relative errors in roundings; as many as there can be for values that are no numbers."""
     errors = {}
     for name, value in values.items():
-        error = np.abs(np.asarray(value, np.float64) / truth - 1) / ROUNDING
+        error = abs(np.asarray(value, np.float64) / truth - 1) / ROUNDING
         errors[name] = np.where(np.isfinite(error), error, NONE_RIGHT)
     return errors
 
@@ -230,8 +231,8 @@ def _hits(
     for name, t in ((OURS, ours), (THEIRS, theirs), (FIRST, first)):
         hit = np.isfinite(t) & (t > 0)
         p = o + np.where(hit, t, 0).astype(np.float64)[:, None] * d
-        scale = np.maximum(np.abs(o).max(axis=1), np.abs(p).max(axis=1))
-        errors[name] = np.where(hit, np.abs(distance(p)) / scale / ROUNDING, NONE_RIGHT)
+        scale = np.maximum(abs(o).max(axis=1), abs(p).max(axis=1))
+        errors[name] = np.where(hit, abs(distance(p)) / scale / ROUNDING, NONE_RIGHT)
     return errors
 
 
@@ -259,7 +260,7 @@ def sphere(scale: float, far: float, count: int) -> Curves:
     ball = Sphere((0, 0, 0), float(r), MIRROR)
 
     def distance(p: Array) -> Array:
-        return np.linalg.norm(p, axis=1) - ball.radius
+        return norm(p, axis=1) - ball.radius
 
     return _hits(ball, (o, d), distance, first, {"type": "sphere", "radius": ball.radius})
 
@@ -295,7 +296,7 @@ def _axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Cur
     tip = np.float32(height / 2 * axis).astype(np.float64)
     base = -tip
     along = unit(tip - base)
-    height = float(np.linalg.norm(tip - base))
+    height = float(norm(tip - base))
     outwards = unit(np.cross(along, rng.normal(size=(count, 3))))
     down = rng.uniform(0.2, 0.8, (count, 1))
     growth = down if kind is Cone else 1.0
@@ -306,12 +307,12 @@ def _axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Cur
 
     def distance(p: Array) -> Array:
         depth = (tip - p) @ along
-        r = np.linalg.norm(p - tip + depth[:, None] * along, axis=1)
+        r = norm(p - tip + depth[:, None] * along, axis=1)
         if kind is Cylinder:
             return r - radius
         return (r * height - depth * radius) / np.hypot(height, radius)
 
-    stock: dict[str, object] | None = None
+    stock = None
     slope, wide = radius / height, 0.0
     if kind is Cylinder:
         slope, wide = 0.0, radius

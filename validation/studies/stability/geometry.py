@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
+from numpy.linalg import norm
 
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
@@ -131,7 +132,7 @@ def cases(quick: bool) -> Iterator[Case]:
         base = picture(scene)
         for place in PLACES:
             image = picture(placed(scene, place.factor, place.sizes))
-            off = np.abs(image - base).max(axis=-1)
+            off = abs(image - base).max(axis=-1)
             share = np.mean(~(off <= VISIBLE))  # NaN is off
             what = "share of pixels off by more than 2/255"
             yield Case(f"scene {number} {place.name}", what, place.why, share, place.most)
@@ -148,7 +149,7 @@ def placed(scene: Scene, factor: float, sizes: float) -> Scene:
     Its size: the distance from the camera to what it looks at.
     """
     camera = scene.camera
-    size = np.linalg.norm(np.subtract(camera.position, camera.target))
+    size = norm(np.subtract(camera.position, camera.target))
     way = np.array([0.48, -0.6, 0.64]) * sizes * size
 
     def by(p: Any) -> tuple[float, float, float]:
@@ -183,7 +184,7 @@ def measure(kind: str, size: float, count: int) -> Figures:
     n = np.array(trace.hit.si.n).T
     t = np.array(trace.hit.si.t, np.float64)
 
-    length = np.linalg.norm(np.float64(d), axis=1)
+    length = norm(np.float64(d), axis=1)
     unit_d = d / length[:, None]
     distance, _, normal, *_ = nearest([thing], o, unit_d)
     # an object enlarged is the same as rays from nearer by
@@ -197,9 +198,9 @@ def measure(kind: str, size: float, count: int) -> Figures:
     p = o + away[:, None] * d
     front = both & (cosine < -FLATTEST)
     to_light = light - p
-    height = (to_light * normal).sum(axis=1) / np.linalg.norm(to_light, axis=1)
-    largest = np.maximum(scale, np.abs(p).max(axis=1))
-    across = np.abs((np.where(both, t, 0) - away) * cosine) / largest
+    height = (to_light * normal).sum(axis=1) / norm(to_light, axis=1)
+    largest = np.maximum(scale, abs(p).max(axis=1))
+    across = abs((np.where(both, t, 0) - away) * cosine) / largest
     finite = np.isfinite(direct) & (~hit | np.isfinite(n).all(axis=1) & np.isfinite(t))
     wrong = (hit != exists) & (in_larger == in_smaller)
     above = height > FLATTEST + OUTLINE * rounding

@@ -70,7 +70,7 @@ def fresnel_error(cosines: np.ndarray, iors: np.ndarray) -> float:
     """The largest relative error of the dielectric term."""
     truth = [float(exact.fresnel_dielectric(c, 1, n)) for c, n in zip(cosines, iors, strict=True)]
     found = np.array(fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors)), np.float64)
-    return float(np.abs(found / truth - 1).max())
+    return float(abs(found / truth - 1).max())
 
 
 def errors(lobes: Arrays) -> Arrays:
@@ -91,8 +91,8 @@ def errors(lobes: Arrays) -> Arrays:
     dr.forward(alpha)
     slope = np.array(dr.grad(value[0]), float)
     terms = {"D": d, "G": g, "BSDF cos": value[0], "pdf": pdf}
-    of = {name: np.abs(np.array(dr.detach(x), float) / lobes[name] - 1) for name, x in terms.items()}
-    of["gradient in alpha"] = np.abs(slope - lobes["gradient"]) / lobes["slope"]
+    of = {name: abs(np.array(dr.detach(x), float) / lobes[name] - 1) for name, x in terms.items()}
+    of["gradient in alpha"] = abs(slope - lobes["gradient"]) / lobes["slope"]
     return {name: np.where(np.isnan(error), np.inf, error) for name, error in of.items()}
 
 

@@ -180,4 +180,4 @@ def difference(image: np.ndarray, truth: np.ndarray) -> float:
     """The largest difference in a channel that 95 % of the pixels stay below; inf for bad values."""
     if not (np.isfinite(image) & (image >= 0)).all():
         return np.inf
-    return float(np.quantile((np.abs(image - truth) / (truth + SMALL)).max(axis=-1), SHARE))
+    return float(np.quantile((abs(image - truth) / (truth + SMALL)).max(axis=-1), SHARE))
