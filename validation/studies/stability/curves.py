@@ -21,7 +21,7 @@ from mrt_mitsuba.validation.studies.roughconductor import theirs as other_lobe
 from mrt_mitsuba.validation.studies.stability.geometry import MIRROR, ROUNDING, ends, lit, trace_of
 from mrt_mitsuba.validation.tools import diagrams
 from mrt_mitsuba.validation.tools.bsdf_probe import evaluate
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import Study, Values
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,7 +98,7 @@ def show(study: Study, *, quick: bool, places: int = 0) -> None:
 
 def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
     """Draw errors in roundings of float32 along an axis; all axes have the same scale."""
-    looks: dict[str, dict[str, Any]] = {
+    looks: dict[str, Values] = {
         FIRST: {"color": diagrams.GREY, "linestyle": (0, (4, 2)), "linewidth": 1.4},
         THEIRS: {"color": diagrams.COLORS[1], "linewidth": 1.4},
         OURS: {"color": diagrams.COLORS[0], "linewidth": 2.4},
@@ -112,7 +112,7 @@ def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
     axes.set_xlabel(axis.label, **diagrams.WORDS)
     axes.set_ylabel("error in roundings", **diagrams.WORDS)
     axes.grid(alpha=0.2)
-    place: dict[str, Any] = {"transform": axes.get_yaxis_transform(), "va": "bottom", "ha": "center"}
+    place: Values = {"transform": axes.get_yaxis_transform(), "va": "bottom", "ha": "center"}
     axes.text(
         0.5, 1.3 * NONE_RIGHT, "no digit is right", color=diagrams.GREY, fontsize=diagrams.LABELS, **place
     )
