@@ -115,9 +115,9 @@ class Case(Subject):
         u = self.uniform(half, 5)
         reach = (size * self.rng.uniform(0.1, 1, half)).astype(np.float32)
 
-        def along(time: mi.Float, place: mi.Point2f, way: mi.Point2f, reach: mi.Float) -> list[mi.Point3f]:
+        def along(time: mi.Float, place: mi.Point2f, way: mi.Point2f, reach: mi.Float) -> mi.Point3f:
             ray, _ = self.plugin.sample_ray(0, time, place, way)
-            return [ray.o + reach * ray.d]
+            return ray.o + reach * ray.d
 
         columns = ("Float", u[:, 0]), ("Point2f", u[:, 1:3]), ("Point2f", u[:, 3:]), ("Float", reach)
         try:
@@ -275,9 +275,9 @@ def _directions(case: Case, u: Array) -> Array:
     """Sampled directions from one point, by random numbers [N, 2]. [N, 3]"""
     o = mi.Point3f(*map(float, case.points[0]))
 
-    def call(u: mi.Point2f) -> list[mi.Vector3f]:
+    def call(u: mi.Point2f) -> mi.Vector3f:
         ds, _ = case.plugin.sample_direction(_seen_from(o), u)
-        return [ds.d]
+        return ds.d
 
     return lanes(call, ("Point2f", u))[0]
 

@@ -16,7 +16,7 @@ Array = np.ndarray
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
 BEYOND = "relative, beyond 8 times what the rounding of directions explains"  # as ``excess`` has it
 Part = TypeVar("Part", bound="Lanes")
-Call = Callable[["mi.BSDFContext", "mi.SurfaceInteraction3f", "mi.Vector3f"], Sequence[Any]]
+Call = Callable[..., Any]  # its values are a Dr.Jit array, or several
 
 
 class Lanes(SimpleNamespace):
@@ -93,22 +93,26 @@ class Probe:
         wi = np.broadcast_to(wi, (count, 3))
         uv = np.broadcast_to(uv, (count, 2))
 
-        def at(i: mi.Vector3f, t: mi.Point2f, o: mi.Vector3f) -> Sequence[Any]:
+        def at(i: mi.Vector3f, t: mi.Point2f, o: mi.Vector3f) -> Any:
             return call(ctx or context(), interaction(i, t), o)
 
         return lanes(at, ("Vector3f", wi), ("Point2f", uv), ("Vector3f", wo))
 
     def eval(self, wi: Array, wo: Array, uv: Array, ctx: mi.BSDFContext | None = None) -> Array:
         """f |cos θo|. [N, channels]"""
-        return self.ask(lambda *at: [self.plugin.eval(*at)], wi, wo, uv, ctx)[0]
+        return self.ask(self.plugin.eval, wi, wo, uv, ctx)[0]
 
     def pdf(self, wi: Array, wo: Array, uv: Array, ctx: mi.BSDFContext | None = None) -> Array:
         """The density per solid angle. [N]"""
-        return self.ask(lambda *at: [self.plugin.pdf(*at)], wi, wo, uv, ctx)[0]
+        return self.ask(self.plugin.pdf, wi, wo, uv, ctx)[0]
 
     def both(self, wi: Array, wo: Array, uv: Array, ctx: mi.BSDFContext | None = None) -> list[Array]:
         """``eval`` and ``pdf``, each by itself."""
-        return self.ask(lambda *at: [self.plugin.eval(*at), self.plugin.pdf(*at)], wi, wo, uv, ctx)
+
+        def values(*at: Any) -> list[mi.Spectrum]:
+            return [self.plugin.eval(*at), self.plugin.pdf(*at)]
+
+        return self.ask(values, wi, wo, uv, ctx)
 
     def pair(self, wi: Array, wo: Array, uv: Array, ctx: mi.BSDFContext | None = None) -> list[Array]:
         """The two of ``eval_pdf``."""
@@ -151,33 +155,30 @@ def first_of(bad: mi.Mask, **columns: mi.Point3f) -> tuple[int, Lanes]:
     return dr.width(wrong), Lanes(**first)
 
 
-def lanes(call: Callable[..., Sequence[Any]], *columns: tuple[str, Array]) -> list[Array]:
+def lanes(call: Call, *columns: tuple[str, Array]) -> list[Array]:
     """Call ``call`` with columns [N] or [N, k] as Mitsuba types, in scalar variants once for each row.
 
     The values come back as arrays [N] or [N, k]; those of polarized light are the intensity.
     """
     count = len(columns[0][1])
     if is_scalar():
-        rows = [_row(call, i, columns) for i in range(count)]
+        rows = []
+        for row in zip(*(column for _, column in columns), strict=True):
+            numbers = zip(columns, row, strict=True)
+            arguments = [getattr(mi, kind)(*np.atleast_1d(number).tolist()) for (kind, _), number in numbers]
+            rows.append([np.asarray(value) for value in _values(call, arguments)])
         return [np.array(values) for values in zip(*rows, strict=True)]
     with dr.suspend_grad():
-        arguments = [as_mitsuba(kind, column) for kind, column in columns]
-        values = [_unpolarized(value) for value in call(*arguments)]
+        values = _values(call, [as_mitsuba(kind, column) for kind, column in columns])
         dr.eval(values)
     return [_as_numpy(value, count) for value in values]
 
 
-def _row(call: Callable[..., Sequence[Any]], i: int, columns: Sequence[tuple[str, Array]]) -> list[Array]:
-    """The values that a scalar variant gives for one row of the columns."""
-    arguments = []
-    for kind, column in columns:
-        numbers = np.atleast_1d(column[i]).tolist()
-        arguments.append(getattr(mi, kind)(*numbers))
-    return [np.asarray(_unpolarized(value)) for value in call(*arguments)]
-
-
-def _unpolarized(value: Any) -> Any:
-    return mi.unpolarized_spectrum(value) if dr.is_matrix_v(value) else value
+def _values(call: Call, arguments: Sequence[Any]) -> list[Any]:
+    """The values of a call; those of polarized light are the intensity."""
+    values = call(*arguments)
+    several = values if isinstance(values, list | tuple) else [values]
+    return [mi.unpolarized_spectrum(value) if dr.is_matrix_v(value) else value for value in several]
 
 
 def _as_numpy(value: Any, count: int) -> Array:

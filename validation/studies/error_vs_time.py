@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -92,14 +92,11 @@ def shown(scene: Number) -> Cost:
     return replace(DOCS, size=(width, width * 3 // 4))
 
 
-@dataclass(frozen=True)
-class Limit:
-    """A bound on a figure of what was found."""
+Limit = tuple[str, float, float, str]  # what is measured, how much, the most that it may be, and why
 
-    what: str
-    figure: Callable[[Findings], float]
-    most: float
-    why: str
+
+def unlimited(found: Findings) -> Sequence[Limit]:
+    return ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +109,7 @@ class Trade:
     cases: dict[str, Options]
     reference: Any
     shared: Options = field(default_factory=dict)
-    limits: tuple[Limit, ...] = ()
+    limits: Callable[[Findings], Sequence[Limit]] = unlimited
 
     def measure(self, cost: Cost, progress: Progress | None = None) -> Findings:
         """Render all cases."""
@@ -136,8 +133,8 @@ def run(study: Study, *, quick: bool) -> None:
         found = trade.measure(cost)
         where = f"{title_of(number).lower()}, {name}"
         describe(study, found, where, f"{title_of(number)}: {trade.title}", trade.truth)
-        for limit in () if found.failed else trade.limits:
-            study.at_most(f"{where}: {limit.what}", limit.figure(found), limit.most, limit.why)
+        for what, measured, most, reason in () if found.failed else trade.limits(found):
+            study.at_most(f"{where}: {what}", measured, most, reason)
         del trade, found  # what holds them is freed with them
 
 
@@ -172,13 +169,14 @@ def rmse(found: Findings, case: str) -> float:
     return found.points[case].rmse
 
 
-def judged(case: str) -> Limit:
+def judged(found: Findings, case: str) -> Limit:
     """The limit of the reference's error, by the case of least error."""
-    return Limit(
+    why = "then it changes no error by more than an eighth, and the judge is better than the judged"
+    return (
         "error of the reference / least error it judges",
-        lambda found: found.reference_error / rmse(found, case),
+        found.reference_error / rmse(found, case),
         0.5,
-        "then it changes no error by more than an eighth, and the judge is better than the judged",
+        why,
     )
 
 
@@ -190,10 +188,6 @@ def _scene(number: Number, size: tuple[int, int], **options: Any) -> Options:
     box = mi.cornell_box()
     box["sensor"]["film"] |= {"width": height, "height": height}
     return box
-
-
-def _with_sampler(nodes: Options, sampler: str) -> Options:
-    return nodes | {"sensor": nodes["sensor"] | {"sampler": {"type": sampler}}}
 
 
 def _rounds(cost: Cost, **options: Any) -> dict[str, Options]:
@@ -220,13 +214,10 @@ def sampling(number: int, cost: Cost) -> Trade:
         if mode == "none" or (aa > 1 and lattice in cost.lattices)
     }
 
-    def against_few(case: str) -> Limit:
-        return Limit(
-            f"RMSE of {case} / {few}",
-            lambda found: rmse(found, case) / rmse(found, few),
-            2 * least / greatest,
-            why,
-        )
+    def limits(found: Findings) -> list[Limit]:
+        worst = 2 * least / greatest
+        gains = [(f"RMSE of {case} / {few}", rmse(found, case) / rmse(found, few)) for case in (many, edges)]
+        return [*((what, gain, worst, why) for what, gain in gains), judged(found, many)]
 
     return Trade(
         title="anti-aliasing mode, aa and lattice",
@@ -237,7 +228,7 @@ def sampling(number: int, cost: Cost) -> Trade:
             {"aa": aa, "aamode": "none", "lattice": "centered", "focaldist": 0}
             for aa in (cost.most, cost.most * 3 // 4)
         ],
-        limits=(against_few(many), against_few(edges), judged(many)),
+        limits=limits,
     )
 
 
@@ -251,6 +242,17 @@ def whitted(number: int, cost: Cost) -> Trade:
     default = list(cases)[1]
     cases |= {f"max_depth={depth}": integrator(max_depth=depth) for depth in DEPTHS}
     first, last = (f"max_depth={depth}" for depth in (DEPTHS[0], DEPTHS[-1]))
+
+    def limits(found: Findings) -> list[Limit]:
+        largest = found.points[default].difference.largest
+        gain = rmse(found, last) - rmse(found, first)
+        promise = "as promised; one 16 times too large leaves more"
+        effect = "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0"
+        return [
+            ("largest error of the default cut-off", largest, PROMISED, promise),
+            (f"RMSE of {last} - that of {first}", gain, -3e-4, effect),
+        ]
+
     return Trade(
         title="cut-off, bounce limit, Fresnel form",
         truth="no cut-off, max_depth=10, exact Fresnel, the same rays",
@@ -258,20 +260,7 @@ def whitted(number: int, cost: Cost) -> Trade:
         cases={**cases, "fresnel=schlick": {"scene": _scene(number, cost.path_size)}},
         reference=integrator(min_contribution=0.0),
         shared={"aa": 2, "aamode": "none", "lattice": "report"},
-        limits=(
-            Limit(
-                "largest error of the default cut-off",
-                lambda found: found.points[default].difference.largest,
-                PROMISED,
-                "as promised; one 16 times too large leaves more",
-            ),
-            Limit(
-                f"RMSE of {last} - that of {first}",
-                lambda found: rmse(found, last) - rmse(found, first),
-                -3e-4,
-                "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0",
-            ),
-        ),
+        limits=limits,
     )
 
 
@@ -281,22 +270,20 @@ def path(number: Number, cost: Cost) -> Trade:
     kinds = ("path", "direct") if number in CALM else ("path",)
     cases = {f"{kind} spp={spp}": {"integrator": kind, "spp": spp} for kind in kinds for spp in cost.counts}
     for sampler in cost.samplers:
-        own = {"scene": _with_sampler(nodes, sampler), "integrator": "path"}
+        sensor = nodes["sensor"] | {"sampler": {"type": sampler}}
+        own = {"scene": nodes | {"sensor": sensor}, "integrator": "path"}
         cases |= {f"{sampler} spp={spp}": {**own, "spp": spp} for spp in cost.sampler_counts}
     if number in CALM and cost.counts:
         cases["mrt_whitted"] = {}
         cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
-    limits: tuple[Limit, ...] = ()
-    if number in CALM and cost.counts:
+
+    def limits(found: Findings) -> list[Limit]:
         few, many = (f"path spp={spp}" for spp in (cost.counts[0], cost.counts[-1]))
         gain = (cost.counts[-1] / cost.counts[0]) ** 0.5
-        by_theory = Limit(
-            f"|RMSE of {many} / {few} / theory - 1|",
-            lambda found: abs(rmse(found, many) / rmse(found, few) * gain - 1),
-            0.15,
-            "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15",
-        )
-        limits = (by_theory, judged(many))
+        off = abs(rmse(found, many) / rmse(found, few) * gain - 1)
+        why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
+        return [(f"|RMSE of {many} / {few} / theory - 1|", off, 0.15, why), judged(found, many)]
+
     return Trade(
         title="Whitted, direct and path at rising spp",
         truth=f"path with spp={cost.path_spp}",
@@ -304,7 +291,7 @@ def path(number: Number, cost: Cost) -> Trade:
         cases=cases | _rounds(cost, integrator="path"),
         reference={"integrator": "path", "spp": cost.path_spp},
         shared={"aa": 1, "aamode": "none"},
-        limits=limits,
+        limits=limits if number in CALM and cost.counts else unlimited,
     )
 
 

@@ -107,7 +107,11 @@ class ChangedShape:
             raise AttributeError(name)
         sound = getattr(self.scene if name in TRACED else self.shape, name)
         change = self.changes.get(name, unchanged)
-        return lambda *given: change(sound(*given), *given)
+
+        def method(*given):
+            return change(sound(*given), *given)
+
+        return method
 
 
 def changed_sky(changes):

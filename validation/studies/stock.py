@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
@@ -79,7 +80,7 @@ def gloss(study: Study, *, quick: bool) -> None:
     def spheres(alpha: float) -> Nodes:
         """Four black, shiny spheres in a smooth environment."""
         black: Nodes = {"alpha": alpha, "ior": 3.0, "diffuse": (0, 0, 0), "specular": (1, 1, 1)}
-        scene = with_materials(report_scene(0), lambda m: replace(m, **black))
+        scene = with_materials(report_scene(0), partial(replace, **black))
         nodes = replace(scene, planes=(), lights=()).to_dict(width=width, height=height, fresnel="dielectric")
         return nodes | {"sky": {"type": "envmap", "bitmap": mi.Bitmap(waves.astype(np.float32))}}
 

@@ -68,7 +68,7 @@ def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float, str]], size: f
     gap = 1.35 * size * drawn.dpi / 72 / height
     to_axes = axes.transAxes.inverted()
     wanted = {name: to_axes.transform(axes.transData.transform(end[:2]))[1] for name, end in ends.items()}
-    names = sorted(wanted, key=lambda name: wanted[name])
+    names = sorted(wanted, key=wanted.__getitem__)
     for name, place in zip(names, apart([wanted[name] for name in names], gap), strict=True):
         x, y, color = ends[name]
         lead = {"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.7, "shrinkB": 3}

@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -153,8 +154,12 @@ class Study:
             "failure": self.failure,
             "seconds": round(self.seconds, 2),
         }
-        text = json.dumps(found, default=lambda v: v.item() if isinstance(v, np.generic) else str(v))
+        text = json.dumps(found, default=_plain)
         return dict(json.loads(text, parse_constant=str))
+
+
+def _plain(value: object) -> object:
+    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def findings(part: Callable[..., None], **options: Any) -> Study:
@@ -196,7 +201,11 @@ def ratio_of(seconds: Sequence[float], others: Sequence[float]) -> dict[str, flo
 
 def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> dict[str, float]:
     """Compare two runs in turns, see ``ratio_of``. Both run once before, which compiles their kernels."""
-    sides = [lambda _, side=side: timed(side)[1] for side in (run, other)]
+
+    def seconds(side: Callable[[], Any], turn: int) -> float:
+        return timed(side)[1]
+
+    sides = [partial(seconds, side) for side in (run, other)]
     in_turns(sides, 1)
     return ratio_of(*in_turns(sides, repeats))
 
@@ -299,7 +308,7 @@ def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[st
     }
     options: Any = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True}
     pages = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"), **options)
-    pages.filters |= {"cell": cell, "base64": lambda data: base64.b64encode(data).decode()}
+    pages.filters["cell"] = cell
     shown = {**result, "studies": studies, "images": images, "title": title, "explain": title == VALIDATION}
     files["index.html"] = pages.get_template("report.html").render(shown).encode()
     return files | {"summary.json": json.dumps(result, indent=2, allow_nan=False).encode() + b"\n"}
@@ -317,7 +326,8 @@ def _drawn(content: Any) -> Values:
         kind = "plot"
         broad = content.get_figwidth() > 6.5
         content.savefig(buffer, format="png", dpi=110, bbox_inches="tight", facecolor="white")
-    return {"data": buffer.getvalue(), "kind": kind, "broad": broad}
+    data = buffer.getvalue()
+    return {"data": data, "base64": base64.b64encode(data).decode(), "kind": kind, "broad": broad}
 
 
 def cell(value: Any) -> str:

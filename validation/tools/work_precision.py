@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -118,7 +119,7 @@ class Findings:
     def families(self) -> dict[str, list[Point]]:
         """The points of each curve, fastest first."""
         groups: dict[str, list[Point]] = {point.family: [] for point in self.points.values()}
-        for point in sorted(self.points.values(), key=lambda p: p.seconds):
+        for point in sorted(self.points.values(), key=attrgetter("seconds")):
             groups[point.family].append(point)
         return groups
 
@@ -142,7 +143,7 @@ class Findings:
         sentences = []
         for error in self.errors:
             reached = {name: t for name, t in self.time_to(error).items() if math.isfinite(t[0])}
-            best, *others = sorted(reached, key=lambda name: reached[name][0]) or [""]
+            best, *others = sorted(reached, key=reached.__getitem__) or [""]
             like = [name for name in others if not reached[best][2] < reached[name][1]]
             if like:
                 verdict = f"no winner, for the intervals overlap: {', '.join([best, *like])}"
@@ -160,7 +161,8 @@ class Findings:
         """A row for each of ``errors``: the case that gets there first, and the next other curve."""
         rows = []
         for error in self.errors:
-            low = sorted((p for p in self.points.values() if p.rmse <= error), key=lambda p: p.seconds)
+            low = [p for p in self.points.values() if p.rmse <= error]
+            low.sort(key=attrgetter("seconds"))
             others = [point for point in low if point.family != low[0].family]
             row = {"to get to an error of": error, "use": "nothing comes so low"}
             row |= {"seconds": None, "next best": None, "which takes": None}

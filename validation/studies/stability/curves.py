@@ -249,7 +249,12 @@ def _quadratic(a: Array, b: Array, c: Array, holds: Callable[[Array], Array] = n
     return both.min(axis=0)
 
 
-def sphere(scale: float, far: float, count: int) -> Curves:
+def distant(far: float, count: int) -> Curves:
+    """Measure hits of a ball seen from so many radii."""
+    return sphere(1.0, count, far)
+
+
+def sphere(scale: float, count: int, far: float = 3.0) -> Curves:
     """Measure hits of a ball of a scale seen from so many radii."""
     rng = np.random.default_rng(5)
     eyes = unit(rng.normal(size=(count, 3))) * scale * far
@@ -274,7 +279,11 @@ def floor(far: float, count: int) -> Curves:
     first = -(o @ np.float32(up)) / (d @ np.float32(up))
     turned = mi.ScalarTransform4f().look_at([0, 0, 0], up.tolist(), [0, 0, 1]).scale(2 * far)
     stock = {"type": "rectangle", "to_world": turned}
-    return _hits(Plane(tuple(normal), 0.0, MIRROR), (o, d), lambda p: p @ up, first, stock)
+
+    def distance(p: Array) -> Array:
+        return p @ up
+
+    return _hits(Plane(tuple(normal), 0.0, MIRROR), (o, d), distance, first, stock)
 
 
 def cone(slender: float, count: int) -> Curves:
@@ -335,7 +344,11 @@ def _first_side(rays: Rays, tip: Array, axis: Array, tangent: np.float32, r: np.
     a = dot(across, across) - k * faster**2
     b = 2 * (dot(q, across) - k * depth * faster)
     c = dot(q, q) - k * depth**2 - r * r
-    return _quadratic(a, b, c, lambda t: depth + t * faster >= 0)  # one half of a double cone
+
+    def below_tip(t: Array) -> Array:
+        return depth + t * faster >= 0
+
+    return _quadratic(a, b, c, below_tip)  # one half of a double cone
 
 
 AXES = (
@@ -345,6 +358,6 @@ AXES = (
     Axis("hit with a floor", "distance / height of the eye", "rectangle", (0, 6), floor, 16),
     Axis("hit with a cone", "height / radius", "256-sided mesh", (-4, 4), cone, 16),
     Axis("hit with a cylinder", "height / radius", "cylinder", (-4, 4), cylinder, 16),
-    Axis("hit with a ball", "scale of the scene", "sphere", (-6, 6), lambda s, n: sphere(s, 3.0, n), 16),
-    Axis("hit with a ball", "distance / radius", "sphere", (1, 5), lambda far, n: sphere(1.0, far, n), 16),
+    Axis("hit with a ball", "scale of the scene", "sphere", (-6, 6), sphere, 16),
+    Axis("hit with a ball", "distance / radius", "sphere", (1, 5), distant, 16),
 )

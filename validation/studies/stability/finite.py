@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import filters, runtime
-from mrt_mitsuba.validation.checks.probe import not_finite
+from mrt_mitsuba.validation.checks.probe import Array, not_finite
 from mrt_mitsuba.validation.studies.stability.case import Case
 
 SHAPES = ((1, 1), (1, 17), (17, 1), (2, 2), (3, 3), (1, 2), (40, 30))
 MODES = ("report", "corrected")
 # A blurred pixel is a weighted mean of at most 16² others: sums of as many float32 products
 MEAN = 64 * 2.0**-24
-EDGES: dict[str, Callable[[np.ndarray, np.ndarray], Any]] = {
-    "luma": lambda image, depth: filters.luma_edges(image),
-    "sobel": lambda image, depth: filters.sobel_edges(image),
-    "geometry": lambda image, depth: filters.geometry_edges(np.full_like(image, 3**-0.5), depth),
-}
+DETECTORS = ("luma", "sobel", "geometry")
 
 
 def of_filters(quick: bool) -> Iterator[Case]:
@@ -34,7 +30,7 @@ def of_filters(quick: bool) -> Iterator[Case]:
             yield replace(case, name=f"{case.name} ({variant})")
 
 
-def _blurred(image: np.ndarray, depth: np.ndarray, mode: str, f: float = 2.0, r: float = 0.5) -> np.ndarray:
+def _blurred(image: Array, depth: Array, mode: str, f: float = 2.0, r: float = 0.5) -> Array:
     return np.asarray(filters.gaussian_dof(image, depth, mode=mode, focal_distance=f, focal_range=r))
 
 
@@ -66,20 +62,30 @@ def _blurs() -> Iterator[Case]:
     yield Case("huge ranges, blur", what, "means are finite", np.sum(~np.isfinite(found)), 0)
 
 
+def _edges(name: str, image: Array, depth: Array) -> tuple[Array, Array]:
+    """The values of a detector, and which pixels it marks."""
+    if name == "geometry":
+        edges = filters.geometry_edges(np.full_like(image, 3**-0.5), depth)
+    else:
+        edges = getattr(filters, f"{name}_edges")(image)
+    return np.asarray(edges.value), np.asarray(edges.mask)
+
+
 def _detectors() -> Iterator[Case]:
-    rng, (rows, columns) = np.random.default_rng(7), np.mgrid[:12, :10]
+    rng = np.random.default_rng(7)
+    rows, columns = np.mgrid[:12, :10]
     expected = (abs(rows - 6) < 2) & (abs(columns - 5) < 2)
     huge = np.float32(10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3)))
     far = np.float32(10 ** rng.uniform(-37, 37, (20, 20)))
-    for name, find in EDGES.items():
-        wrong = np.isnan(np.asarray(find(huge, far).value)).sum()
+    for name in DETECTORS:
+        wrong = np.isnan(_edges(name, huge, far)[0]).sum()
         for value in (np.nan, np.inf):
             image = np.full((12, 10, 3), 0.5, np.float32)
             depth = np.full((12, 10), 3, np.float32)
-            image[6, 5, 2], depth[6, 5] = value, np.nan  # an infinite depth is a miss
-            found = find(image, depth)
-            wrong += (np.isinf(np.asarray(found.value)) != expected).sum()
-            wrong += (~np.asarray(found.mask) & expected).sum()
+            image[6, 5, 2] = value
+            depth[6, 5] = np.nan  # an infinite depth is a miss
+            values, mask = _edges(name, image, depth)
+            wrong += (np.isinf(values) != expected).sum() + (~mask & expected).sum()
         what = "pixels not marked in its 3×3, or marked elsewhere; NaN among the values of pictures to ±1e34"
         yield Case(f"nan or inf in a picture, huge ranges, {name}", what, "reported, and local", wrong, 0)
 
@@ -114,22 +120,23 @@ def bad_lanes(form: str, visible: bool, count: int, seed: int) -> int:
     """Count bad values, densities, samples and mirror reflectances; each lane has its alpha and indices."""
     generator = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
 
-    def mixed(ordinary: Callable[[mi.Float], mi.Float], extremes: Sequence[float]) -> mi.Float:
-        """A function of uniform numbers, in every third lane an extreme."""
-        found = ordinary(generator.next_float32())
+    draw = generator.next_float32
+
+    def mixed(ordinary: mi.Float, extremes: Sequence[float]) -> mi.Float:
+        """Ordinary numbers, in every third lane an extreme."""
         table = mi.Float(np.array(extremes, np.float32))
-        index = mi.UInt32(generator.next_float32() * 3 * len(extremes))
+        index = mi.UInt32(draw() * 3 * len(extremes))
         extreme = index < len(extremes)
-        return dr.select(extreme, dr.gather(mi.Float, table, index, extreme), found)
+        return dr.select(extreme, dr.gather(mi.Float, table, index, extreme), ordinary)
 
     def uniform() -> mi.Float:
-        return mixed(lambda u: u, (0, 6e-8, 0.5, 1 - 6e-8))
+        return mixed(draw(), (0, 6e-8, 0.5, 1 - 6e-8))
 
     def decades(least: float, most: float, extremes: Sequence[float]) -> mi.Float:
-        return mixed(lambda u: least * dr.exp(u * float(np.log(most / least))), extremes)
+        return mixed(least * dr.exp(draw() * math.log(most / least)), extremes)
 
     def direction() -> mi.Vector3f:
-        z = mixed(lambda u: 2 * u - 1, COSINES)
+        z = mixed(2 * draw() - 1, COSINES)
         sine, cosine = dr.sincos(2 * dr.pi * uniform())
         r = dr.sqrt(dr.maximum((1 - z) * (1 + z), 0))
         return mi.Vector3f(r * cosine, r * sine, z)
@@ -138,12 +145,13 @@ def bad_lanes(form: str, visible: bool, count: int, seed: int) -> int:
     bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": form, "sample_visible": visible, **bright})
     parameters = mi.traverse(bsdf)
     parameters["alpha"] = dr.select(uniform() < 0.8, mi.Float(1), -1) * decades(1e-9, 1e3, ALPHAS)
-    parameters["int_ior"], parameters["ext_ior"] = decades(1e-3, 1e3, IORS), decades(0.5, 2, IORS)
+    parameters["int_ior"] = decades(1e-3, 1e3, IORS)
+    parameters["ext_ior"] = decades(0.5, 2, IORS)
     parameters.update()
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.wi = direction()
     context = mi.BSDFContext()
-    away = mi.Vector3f(*(mixed(lambda u: 4 * u - 2, NUMBERS) for _ in range(3)))
+    away = mi.Vector3f(*(mixed(4 * draw() - 2, NUMBERS) for _ in range(3)))
     near = mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z) + 10.0 ** (-9 * uniform()) * away
     near = dr.normalize(near)  # where narrow lobes are
     wo = dr.select((uniform() < 0.5) & dr.all(dr.isfinite(near)), near, direction())

@@ -5,7 +5,7 @@ The laws of ``check_shape`` hold what needs no other renderer; here, rays have a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -16,8 +16,9 @@ from numpy.linalg import norm
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.oracles.reference import nearest, unit
+from mrt_mitsuba.validation.oracles.reference import Array, nearest, unit
 from mrt_mitsuba.validation.studies.stability.case import Case
+from mrt_mitsuba.validation.tools.study import Values
 
 ROUNDING = 2.0**-24
 DECADES = 10.0 ** np.arange(-6, 7, 2)
@@ -103,14 +104,18 @@ LIMITS = (  # of the figures, in their order
 
 MIRROR = Material(1.5, 1.0, (1, 1, 1), (1, 1, 1))
 CORNERS = np.array([(-0.8, -0.5, 0.1), (0.9, -0.3, -0.2), (0.1, 0.9, 0.3)])
-# Objects of about a size around the origin, by the name that a scene has for their kind
-SOLIDS: dict[str, Callable[[float], Any]] = {
-    "spheres": lambda size: Sphere((0, 0, 0), size, MIRROR),
-    "planes": lambda size: Plane((0.6, 0.64, 0.48), 0.3 * size, MIRROR),
-    "meshes": lambda size: Mesh(np.float32(CORNERS * size), np.array([[0, 1, 2]], np.uint32), MIRROR),
-    "cones": lambda size: Cone(*ends(size), 0.5 * size, MIRROR),
-    "cylinders": lambda size: Cylinder(*ends(size), 0.5 * size, MIRROR),
-}
+
+
+def solids(size: float) -> Values:
+    """Objects of about a size around the origin, by the name that a scene has for their kind."""
+    triangle = np.array([[0, 1, 2]], np.uint32)
+    return {
+        "spheres": Sphere((0, 0, 0), size, MIRROR),
+        "planes": Plane((0.6, 0.64, 0.48), 0.3 * size, MIRROR),
+        "meshes": Mesh(np.float32(CORNERS * size), triangle, MIRROR),
+        "cones": Cone(*ends(size), 0.5 * size, MIRROR),
+        "cylinders": Cylinder(*ends(size), 0.5 * size, MIRROR),
+    }
 
 
 def ends(size: float) -> tuple[Any, Any]:
@@ -121,7 +126,7 @@ def ends(size: float) -> tuple[Any, Any]:
 def cases(quick: bool) -> Iterator[Case]:
     """Yield single objects, then the report's scenes scaled and moved."""
     count = 300 if quick else 3000
-    for kind in SOLIDS:
+    for kind in solids(1):
         sizes = DECADES[::3] if quick else DECADES
         worst = np.max([measure(kind, size, count) for size in sizes], axis=0)
         for name, limit, figure in zip(Figures._fields, LIMITS, worst, strict=True):
@@ -138,7 +143,7 @@ def cases(quick: bool) -> Iterator[Case]:
             yield Case(f"scene {number} {place.name}", what, place.why, share, place.most)
 
 
-def picture(scene: Scene) -> np.ndarray:
+def picture(scene: Scene) -> Array:
     """Render with one ray per pixel; [H, W, 3]."""
     return render(scene, width=120, height=90, aa=1, aamode="none").image
 
@@ -175,9 +180,11 @@ def measure(kind: str, size: float, count: int) -> Figures:
     d = np.concatenate(ways)
     scale = np.maximum(np.repeat(distances, count), size)
     rounding = ROUNDING * scale / size  # of the largest coordinate, in sizes
-    thing = SOLIDS[kind](size)
+    thing = solids(size)[kind]
     light = np.array([3.0, 5.0, 4.0]) * size
-    scene = _alone(kind, thing, light, size)  # which rays may still need when their results are read
+    # and another thing so small and far off that no ray meets it; rays may need the scene for their results
+    aside = {"type": "sphere", "center": [1.7 * size] * 3, "radius": 1e-3 * size, "flip_normals": True}
+    scene = mi.load_dict(lit(kind, thing, light.tolist()) | {"aside": aside})
     trace = trace_of(scene, o, d)
     hit = np.array(trace.hit.found)
     direct = np.array(trace.direct[0])
@@ -212,33 +219,26 @@ def measure(kind: str, size: float, count: int) -> Figures:
     )
 
 
-def _alone(kind: str, thing: Any, light: np.ndarray, size: float) -> mi.Scene:
-    """A scene with a thing under a light, and another so small and far off that no ray meets it."""
-    nodes = lit(kind, thing, light.tolist())
-    aside = {"type": "sphere", "center": [1.7 * size] * 3, "radius": 1e-3 * size, "flip_normals": True}
-    return mi.load_dict(nodes | {"aside": aside})
-
-
-def lit(kind: str, thing: Any, light: Sequence[float]) -> dict[str, Any]:
-    """The nodes of a scene of a thing, of a kind as in ``SOLIDS``, under a light."""
+def lit(kind: str, thing: Any, light: Sequence[float]) -> Values:
+    """The nodes of a scene of a thing, of a kind as in ``solids``, under a light."""
     x, y, z = light
-    empty: Any = Scene(Camera((0, 0, 9), (0, 0, 0)), (0, 0, 0), (Light((x, y, z), (1, 1, 1)),))
-    nodes: dict[str, Any] = replace(empty, **{kind: (thing,)}).to_dict(fresnel="unity")
-    return nodes
+    camera = Camera((0, 0, 9), (0, 0, 0))
+    things: Values = {kind: (thing,)}
+    return Scene(camera, (0, 0, 0), (Light((x, y, z), (1, 1, 1)),), **things).to_dict(fresnel="unity")
 
 
-def trace_of(scene: mi.Scene, o: np.ndarray, d: np.ndarray) -> Any:
+def trace_of(scene: mi.Scene, o: Array, d: Array) -> Any:
     """The trace of ``mrt_whitted`` along rays (o, d [N, 3])."""
     whitted = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0, "bounce_budget": "plain"})
     return whitted.trace(scene, None, mi.Ray3f(o.T, d.T))
 
 
-def _rays(size: float, distance: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _rays(size: float, distance: float, count: int) -> tuple[Array, Array]:
     """Rays (o [N, 3], d [N, 3]) from a distance to all parts of an object, a third to its outline."""
     rng = np.random.default_rng(7)
-    towards, across, anywhere = (unit(rng.normal(size=(count, 3))) for _ in range(3))
-    o = (distance * towards).astype(np.float32)
+    towards, across, anywhere = unit(rng.normal(size=(3, count, 3)))
+    o = np.float32(distance * towards)
     outline = 1 + 1e-3 * rng.normal(size=count)
     offset = np.where(rng.random(count) < 1 / 3, outline, rng.uniform(0, 1.2, count))
     aimed = unit(unit(np.cross(towards, across)) * (size * offset)[:, None] - o)
-    return o, (anywhere if distance < 0.05 * size else aimed).astype(np.float32)
+    return o, np.float32(anywhere if distance < 0.05 * size else aimed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import drjit as dr
@@ -34,6 +34,7 @@ NOTE = (
 )
 
 Arrays = dict[str, np.ndarray]
+Cosine = Any  # an array of Dr.Jit's, of float32 or float64
 
 
 def cases(quick: bool) -> Iterator[Case]:
@@ -81,7 +82,8 @@ def errors(lobes: Arrays) -> Arrays:
     dr.enable_grad(alpha)
     bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "dielectric", "diffuse_reflectance": 0.0})
     parameters = mi.traverse(bsdf)
-    parameters["alpha"], parameters["int_ior"] = alpha, mi.Float(lobes["ior"])
+    parameters["alpha"] = alpha
+    parameters["int_ior"] = mi.Float(lobes["ior"])
     parameters.update()
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = wi
@@ -96,14 +98,23 @@ def errors(lobes: Arrays) -> Arrays:
     return {name: np.where(np.isnan(error), np.inf, error) for name, error in of.items()}
 
 
-def _g1(alpha: float) -> Callable[[Any], Any]:
-    return lambda c: microfacet.smith_g1(Columns((dr.sqrt((1 - c) * (1 + c)), c * 0, c)), alpha)
+def schlick(c: Cosine) -> Cosine:
+    return fresnel.fresnel_schlick(c, float(np.float32(0.04)))
 
 
-OF_COSINE: dict[str, Callable[[Any], Any]] = {
-    "Schlick, F0 = 0.04": lambda c: fresnel.fresnel_schlick(c, float(np.float32(0.04))),
-    "exact Fresnel, into n = 1.5": lambda c: fresnel.fresnel_dielectric(c, 1.0, 1.5),
-    **{f"Smith's G1, alpha = {alpha}": _g1(float(np.float32(alpha))) for alpha in (0.05, 0.2, 1.0)},
+def dielectric(c: Cosine) -> Cosine:
+    return fresnel.fresnel_dielectric(c, 1.0, 1.5)
+
+
+def g1(alpha: float, c: Cosine) -> Cosine:
+    sine = dr.sqrt((1 - c) * (1 + c))
+    return microfacet.smith_g1(Columns((sine, c * 0, c)), float(np.float32(alpha)))
+
+
+OF_COSINE: dict[str, Callable[[Cosine], Cosine]] = {
+    "Schlick, F0 = 0.04": schlick,
+    "exact Fresnel, into n = 1.5": dielectric,
+    **{f"Smith's G1, alpha = {alpha}": partial(g1, alpha) for alpha in (0.05, 0.2, 1.0)},
 }
 # the bits of 1, and of the least number with all its digits
 ONE = 0x3F800000
@@ -111,7 +122,7 @@ LEAST = 0x00800000
 CHUNK = 2**24
 
 
-def largest_error(formula: Callable[[Any], Any], stride: int) -> float:
+def largest_error(formula: Callable[[Cosine], Cosine], stride: int) -> float:
     """The largest |float32 − float64| over the step of float32 there, for every ``stride``-th cosine.
 
     In float64, its own error is below 1e-6 of a float32 step: nothing in these forms cancels but 1 − c, which
@@ -151,7 +162,8 @@ def lobes_with_truth(count: int) -> Arrays:
     phi, psi = rng.uniform(0, 2 * np.pi, pairs)
     wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=1)
     m = unit(np.stack([tan * np.cos(psi), tan * np.sin(psi), np.ones(pairs[1])], axis=1))
-    wi, wo = np.float32(wi), np.float32(2 * (wi * m).sum(axis=1, keepdims=True) * m - wi)
+    wo = np.float32(2 * (wi * m).sum(axis=1, keepdims=True) * m - wi)
+    wi = np.float32(wi)
     x, y, z = (wi.astype(np.float64) + wo).T  # along the half vector
     steepness = (x**2 + y**2) / (z * alpha) ** 2
     keep = (wo[:, 2] > 5e-8) & (steepness < STEEPEST)
