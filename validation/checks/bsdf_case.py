@@ -58,31 +58,22 @@ class Case(Subject, Probe):
     @cached_property
     def views(self) -> list[View]:
         """Samples for directions of incidence at all angles."""
-        angles = QUICK_ANGLES if self.quick else ANGLES
-        return [self._view(angle) for angle in angles]
-
-    def _view(self, angle: float) -> View:
-        wi = probe.direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
-        uv = self.uniform(2)
-        u = self.uniform(self.count(2**16, 2**19), 3)
-        samples = self.sample(wi, u, uv)
-        value, pdf = self.both(wi, samples.wo, uv)
-        density = np.where(live(wi, samples, value, pdf), pdf, 0)
-        holes = (density > 0) & ~np.isfinite(value).all(axis=1)
-        first = len(u) // 4
-        rest = samples.wo[first:][density[first:] > 0]
-        return View(
-            wi=wi,
-            uv=uv,
-            u=u,
-            samples=samples,
-            density=density,
-            pilot=samples.wo[:first][density[:first] > 0],
-            codes=encode(rest),
-            count=len(u) - first,
-            share=len(rest) / (len(u) - first),
-            holes=holes.mean(),
-        )
+        views = []
+        for angle in QUICK_ANGLES if self.quick else ANGLES:
+            wi = probe.direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
+            uv = self.uniform(2)
+            u = self.uniform(self.count(2**16, 2**19), 3)
+            samples = self.sample(wi, u, uv)
+            value, pdf = self.both(wi, samples.wo, uv)
+            density = np.where(live(wi, samples, value, pdf), pdf, 0)
+            holes = (density > 0) & ~np.isfinite(value).all(axis=1)
+            first = len(u) // 4
+            pilot = samples.wo[:first][density[:first] > 0]
+            codes = encode(samples.wo[first:][density[first:] > 0])
+            count = len(u) - first
+            share = len(codes) / count
+            views.append(View(wi, uv, u, samples, density, pilot, codes, count, share, holes.mean()))
+        return views
 
     @cached_property
     def drawn(self) -> tuple[Lanes, Lanes]:
@@ -111,7 +102,12 @@ class Case(Subject, Probe):
         seeds = encode(np.concatenate([view.pilot, unit(mirrored)]))
         most = max(len(view.u) // 4000, 8)
         cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
-        if self._unresolved(view, cells, most):
+        crowd = np.bincount(cells.find(encode(view.pilot)), minlength=len(cells.start))
+        crowded = (crowd * ((cells.level == DEPTH) & (crowd > 4 * most))).sum()
+        # at the normal, all azimuths of the finest cells are one place
+        radius = np.hypot(*view.pilot.T[:2])
+        centre = (radius < np.sqrt(2) * 0.5**DEPTH).sum()
+        if max(crowded, centre) > 0.01 * len(view.pilot):  # samples are closer together than the finest cells
             return None
         integrals = integrate(
             lambda wo: np.maximum(self.pdf(view.wi, wo, view.uv), 0),
@@ -130,16 +126,6 @@ class Case(Subject, Probe):
         overlooked = coarse[cell].sum() / view.count
         known = integrals.mean.sum() > view.share or overlooked < OVERLOOKED
         return integrals if known else None
-
-    def _unresolved(self, view: View, cells: Cells, most: int) -> bool:
-        """Whether more than a percent of the samples lie closer together than the finest cells resolve."""
-        cell = cells.find(encode(view.pilot))
-        finest = np.bincount(cell, minlength=len(cells.start))[cells.level == DEPTH]
-        crowded = finest[finest > 4 * most].sum()
-        # at the normal, all azimuths of the finest cells are one place
-        radius = np.hypot(*view.pilot.T[:2])
-        centre = (radius < np.sqrt(2) * 0.5**DEPTH).sum()
-        return max(crowded, centre) > 0.01 * len(view.pilot)
 
     def copy(self) -> Case:
         """A case whose parameters can be changed, with a BSDF of its own if it can be loaded."""

@@ -168,23 +168,16 @@ def weights(law: Law, case: Case) -> None:
     errors = []
     angles = []
     for i, view in enumerate(case.views):
-        beyond = _discrete(view.samples)
-        errors += beyond
-        angles += [i] * len(beyond)
+        s = view.samples
+        lobe = s.component * 4096 + s.type
+        for one in np.unique(lobe[s.delta & s.lit]):  # of one direction
+            here = s.delta & (lobe == one)
+            stated = float(np.nan_to_num(s.pdf[here].mean()))
+            sigma = np.sqrt(max(stated * (1 - stated), 0) / len(here))
+            errors.append(max(abs(here.mean() - stated) - SIGMAS * sigma, 0))
+            angles.append(i)
     if errors:
         law.hold("discrete", errors, case.incidence.only(angles))
-
-
-def _discrete(s: Lanes) -> list[float]:
-    """How far the share of each lobe of one direction is off its stated probability, beyond chance."""
-    lobe = s.component * 4096 + s.type
-    errors = []
-    for one in np.unique(lobe[s.delta & s.lit]):
-        here = s.delta & (lobe == one)
-        stated = float(np.nan_to_num(s.pdf[here].mean()))
-        sigma = np.sqrt(max(stated * (1 - stated), 0) / len(here))
-        errors.append(max(abs(here.mean() - stated) - SIGMAS * sigma, 0))
-    return errors
 
 
 @figures(

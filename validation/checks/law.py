@@ -123,7 +123,15 @@ class Law:
         if figure.statistic in ("at most", "at least"):
             amount = float(errors)
         else:
-            amount, worst = _summary(errors, figure.statistic)
+            worst = np.where(np.isnan(errors), np.inf, errors).argmax()
+            amount = errors[worst]
+            if figure.statistic == "count":
+                amount = errors.sum()
+            elif figure.statistic == "share":
+                amount = errors.mean()
+            elif isinstance(figure.statistic, float):
+                amount = np.nanquantile(errors, figure.statistic)
+                worst = np.nanargmin(abs(errors - amount))
             names = {key: x[worst] if isinstance(x, np.ndarray) else x for key, x in names.items()}
         snippet = ""
         if self.program and figure.snippet:
@@ -187,19 +195,6 @@ class Law:
 
 
 Judge = Callable[[Law, Any], None]  # checks one law of a case
-
-
-def _summary(errors: Array, statistic: str | float) -> tuple[float, int]:
-    """The statistic of N errors, and the index of the error that shows it best."""
-    if isinstance(statistic, float):
-        quantile = np.nanquantile(errors, statistic)
-        return quantile, int(np.nanargmin(abs(errors - quantile)))
-    worst = int(np.where(np.isnan(errors), np.inf, errors).argmax())
-    if statistic == "count":
-        return errors.sum(), worst
-    if statistic == "share":
-        return errors.mean(), worst
-    return errors[worst], worst
 
 
 def _used(part: Part) -> float:

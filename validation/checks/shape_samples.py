@@ -147,7 +147,9 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     axes = case.units(AXES)
     apart = [_distance(p @ axis, crossings @ axis) for axis in axes]
     for axis in np.eye(3):
-        if _is_edge_on(crossings, axis):
+        across = crossings - np.outer(crossings @ axis, axis)
+        widths = np.linalg.svd(np.cov(across.T), compute_uv=False)
+        if widths[1] < 1e-4 * widths[0]:  # in one plane with the axis: azimuths around it are but two
             continue
         for cut in CUTS:
             azimuths = _angle(p - case.middle, axis, cut)
@@ -167,13 +169,6 @@ def _coinciding(case: Case, at: Lanes) -> float:
     other = trace(case.target, leave(at, -at.n), at.n)
     both = one.met & other.met & (one.part != other.part)
     return (both & near(at.p, one.p) & near(at.p, other.p)).mean()
-
-
-def _is_edge_on(p: Array, axis: Array) -> bool:
-    """Whether points [N, 3] lie in one plane with an axis: then azimuths around it are but two."""
-    across = p - np.outer(p @ axis, axis)
-    widths = np.linalg.svd(np.cov(across.T), compute_uv=False)
-    return bool(widths[1] < 1e-4 * widths[0])
 
 
 def _angle(v: Array, axis: Array, cut: float) -> Array:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import singledispatch
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -195,7 +196,7 @@ def nearest(things: Sequence[Any], o: Array, d: Array, reach: Any = np.inf) -> t
     thing = np.full(len(o), -1)
     n, diffuse = np.zeros((2, len(o), 3))
     for number, one in enumerate(things):
-        met, surface = MEET[type(one)](one, o, d)
+        met, surface = meet(one, o, d)
         k = np.flatnonzero((met < t) & (met < reach))
         if len(k):
             normal, color = surface(k)
@@ -210,20 +211,38 @@ def _ahead(t: Array) -> Array:
     return np.where(t > 0, t, np.inf)
 
 
-def _sphere(sphere: Sphere, o: Array, d: Array) -> Met:
+@singledispatch
+def meet(thing: Any, o: Array, d: Array) -> Met:
+    """Where rays meet an object."""
+    raise TypeError(f"no rays meet a {type(thing).__name__}")
+
+
+@meet.register
+def _(sphere: Sphere, o: Array, d: Array) -> Met:
     off = o - sphere.center
     passed = -dot(off, d)
     half = np.sqrt(sphere.radius**2 - dot(off, off) + passed**2)
     t = np.minimum(_ahead(passed - half), _ahead(passed + half))
-    return t, lambda k: (unit(off[k] + t[k, None] * d[k]), None)
+
+    def surface(k: Array) -> tuple[Array, None]:
+        return unit(off[k] + t[k, None] * d[k]), None
+
+    return t, surface
 
 
-def _plane(plane: Plane, o: Array, d: Array) -> Met:
+@meet.register
+def _(plane: Plane, o: Array, d: Array) -> Met:
     normal = unit(plane.normal)
-    return _ahead(-(o @ normal + plane.distance) / (d @ normal)), lambda k: (normal, None)
+
+    def surface(k: Array) -> tuple[Array, None]:
+        return normal, None
+
+    return _ahead(-(o @ normal + plane.distance) / (d @ normal)), surface
 
 
-def _axial(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
+@meet.register(Cone)
+@meet.register(Cylinder)
+def _(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
     """Closed cones, from the apex to the base, and cylinders: from the first end on, the radius is
     ``start + slope height``."""
     cone = isinstance(thing, Cone)
@@ -262,7 +281,8 @@ def _axial(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
     return t, surface
 
 
-def _mesh(mesh: Mesh, o: Array, d: Array) -> Met:
+@meet.register
+def _(mesh: Mesh, o: Array, d: Array) -> Met:
     corners = np.asarray(mesh.vertices, float)[mesh.faces]
     corner = corners[:, 0]
     first = corners[:, 1] - corners[:, 0]
@@ -300,8 +320,3 @@ def _mesh(mesh: Mesh, o: Array, d: Array) -> Met:
         return normal, texels[row % rows, column % columns]
 
     return t, surface
-
-
-MEET: dict[type, Callable[[Any, Array, Array], Met]] = {
-    Sphere: _sphere, Plane: _plane, Cone: _axial, Cylinder: _axial, Mesh: _mesh
-}  # fmt: skip

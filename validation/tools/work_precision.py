@@ -13,7 +13,6 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from operator import attrgetter
 from typing import Any
 
@@ -100,6 +99,29 @@ class Point:
     def resolved(self) -> bool:
         """Whether the error can be distinguished from the reference's own."""
         return self.rmse > RESOLVED * self.reference_error
+
+    def row(self) -> Values:
+        """The row of the table of all cases."""
+
+        def interval(ends: Interval) -> str:
+            return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"
+
+        return {
+            "case": self.name,
+            "seconds": self.seconds,
+            "interval, s": interval(self.seconds_interval),
+            "cold, s": self.cold,
+            "of it compiling, s": self.compile,
+            "RMSE": self.rmse if self.resolved else "at the floor",
+            "interval": interval(self.rmse_interval) if self.resolved else "",
+            "|bias|": self.bias,
+            "interval of it": interval(self.bias_interval),
+            "1 / (variance × s)": self.efficiency,
+            "relMSE": self.difference.rel_mse,
+            "largest": self.difference.largest,
+            "FLIP": self.difference.flip,
+            "rays": sum(self.rays.values()),
+        }
 
 
 @dataclass(frozen=True)
@@ -418,31 +440,5 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
         note = "With 95 % intervals. Between cases, curves are straight in logarithms; beyond, unknown."
         study.records(f"{prefix}times", f"{title}: seconds to an error", times, note, first=not name)
     note = "Medians of warm renders without loading the scene; cold: a first run. Errors in linear light."
-    study.records(f"{prefix}points", f"{title}: every case", _rows(found), note)
-
-
-def _rows(found: Findings) -> list[Values]:
-    """The table of all cases, curve after curve."""
-
-    def interval(ends: Interval) -> str:
-        return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"
-
-    return [
-        {
-            "case": p.name,
-            "seconds": p.seconds,
-            "interval, s": interval(p.seconds_interval),
-            "cold, s": p.cold,
-            "of it compiling, s": p.compile,
-            "RMSE": p.rmse if p.resolved else "at the floor",
-            "interval": interval(p.rmse_interval) if p.resolved else "",
-            "|bias|": p.bias,
-            "interval of it": interval(p.bias_interval),
-            "1 / (variance × s)": p.efficiency,
-            "relMSE": p.difference.rel_mse,
-            "largest": p.difference.largest,
-            "FLIP": p.difference.flip,
-            "rays": sum(p.rays.values()),
-        }
-        for p in chain(*found.families.values())
-    ]
+    points = [point.row() for curve in found.families.values() for point in curve]
+    study.records(f"{prefix}points", f"{title}: every case", points, note)

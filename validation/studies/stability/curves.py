@@ -153,7 +153,13 @@ def _lobes(wi: Array, wo: Array, alpha: float) -> Curves:
     """The roundings of the lobe D G / (4 cos θi), without Fresnel."""
     truth = np.array([_exact_lobe(*pair, alpha) for pair in zip(wi, wo, strict=True)])
     lobes = {name: evaluate(mi.load_dict(of(alpha)), wi, wo)[0][:, 0] for name, of in BSDFS.items()}
-    return _off({**lobes, FIRST: _first_lobe(wi, wo, np.float32(alpha))}, truth)
+    # as the report has it, of cosines alone, in float32
+    a = np.float32(alpha)
+    c = unit(wi + wo)[:, 2]
+    d = np.exp((c**2 - 1) / (c**2 * a**2)) / (np.float32(np.pi) * a**2 * c**4)
+    g = _first_g1(wi[:, 2], a) * _first_g1(wo[:, 2], a)
+    lobes[FIRST] = d * g / (4 * wi[:, 2] * wo[:, 2]) * wo[:, 2]
+    return _off(lobes, truth)
 
 
 def _exact_lobe(wi: Array, wo: Array, alpha: float) -> float:
@@ -162,14 +168,6 @@ def _exact_lobe(wi: Array, wo: Array, alpha: float) -> float:
     cosine = 1 / exact.mp.sqrt(1 + (x * x + y * y) / (z * z))
     g = exact.smith_g1(wi, a) * exact.smith_g1(wo, a)
     return float(exact.beckmann_d(cosine, a) * g / (4 * exact.number(wi[2])))
-
-
-def _first_lobe(wi: Array, wo: Array, alpha: np.float32) -> Array:
-    """The lobe as the report has it, of cosines alone, in float32."""
-    c = unit(wi + wo)[:, 2]
-    d = np.exp((c**2 - 1) / (c**2 * alpha**2)) / (np.float32(np.pi) * alpha**2 * c**4)
-    g = _first_g1(wi[:, 2], alpha) * _first_g1(wo[:, 2], alpha)
-    return d * g / (4 * wi[:, 2] * wo[:, 2]) * wo[:, 2]
 
 
 def _first_g1(cosine: Array, alpha: np.float32) -> Array:

@@ -26,7 +26,7 @@ def of_filters(quick: bool) -> Iterator[Case]:
     """Yield the cases of the filters, in both kinds of variants."""
     for variant in (runtime.SLOW, runtime.FAST):
         runtime.use(variant)
-        for case in (*_blurs(), *_detectors()):
+        for case in (*blurs(), *detectors()):
             yield replace(case, name=f"{case.name} ({variant})")
 
 
@@ -34,7 +34,8 @@ def _blurred(image: Array, depth: Array, mode: str, f: float = 2.0, r: float = 0
     return np.asarray(filters.gaussian_dof(image, depth, mode=mode, focal_distance=f, focal_range=r))
 
 
-def _blurs() -> Iterator[Case]:
+def blurs() -> Iterator[Case]:
+    """Yield blurs of constant, damaged and huge pictures."""
     excess = 0.0
     damage = 0
     rng = np.random.default_rng(1)
@@ -71,7 +72,8 @@ def _edges(name: str, image: Array, depth: Array) -> tuple[Array, Array]:
     return np.asarray(edges.value), np.asarray(edges.mask)
 
 
-def _detectors() -> Iterator[Case]:
+def detectors() -> Iterator[Case]:
+    """Yield detectors on damaged pictures and huge ranges."""
     rng = np.random.default_rng(7)
     rows, columns = np.mgrid[:12, :10]
     expected = (abs(rows - 6) < 2) & (abs(columns - 5) < 2)
