@@ -1,11 +1,11 @@
 """The power of the laws: for each, the least of faults of many sizes that it finds, quick and in full.
 
-A new row is a ``Fault`` in one of the tables at the end, with a function of its size and of what it changes.
+A new row is a call at the end, with a function of the fault's size and of what it changes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -170,13 +170,13 @@ class Fault:
     of the size and of what is changed; ``nested``: what is changed, if not a diffuse BSDF or a cube.
     """
 
+    kind: str  # "BSDF", "shape" or "emitter"
     figure: str
     what: str
     full: float
     changes: Mapping[str, Change]
     quick: float | None = None  # as in full
     nested: Description | None = None
-    kind: str = "BSDF"
 
     @property
     def least_quick(self) -> float:
@@ -502,284 +502,253 @@ def no_density_of_sample(size, ds, u):
 # ------------------------------------------------ Faults ----------------------------------------------
 
 
-def bsdf_fault(figure, what, full, kind, change, *, quick=None, nested=None):
-    """A fault of a BSDF, which changes one kind of answer."""
-    return Fault(figure, what, full, {kind: change}, quick, nested)
+FAULTS: list[Fault] = []
 
 
-def shape_fault(figure, what, full, *, quick=None, nested=None, **changes):
-    """A fault of a shape, which changes some of its methods."""
-    return Fault(figure, what, full, changes, quick, nested, "shape")
+def add_fault(kind, figure, what, full, *, quick=None, nested=None, **changes):
+    """Add a fault that changes some answers of a kind of plugins."""
+    FAULTS.append(Fault(kind, figure, what, full, changes, quick, nested))
 
 
-def sky_fault(figure, what, full, *, quick=None, **changes):
-    """A fault of a constant sky."""
-    return Fault(figure, what, full, changes, quick, None, "emitter")
-
+bsdf_fault = partial(add_fault, "BSDF")
+shape_fault = partial(add_fault, "shape")
+sky_fault = partial(add_fault, "emitter")  # of a constant sky
 
 larger_pdf = of_sample(member("pdf", larger))
 smaller_pdf = of_sample(member("pdf", smaller))
 larger_eta = of_sample(member("eta", larger))
 tilted_normal = member("n", tilted)
 
-BSDF_SAMPLES = (
-    bsdf_fault(
-        "sampling.cells",
-        "density too large where a tenth of the samples go",
-        0.03,
-        "pdf",
-        in_tenth,
-        quick=0.1,
-    ),
-    bsdf_fault(
-        "sampling.small", "density too small in a cone of 1 degree", 0.5, "pdf", in_cone, quick=np.inf
-    ),
-    bsdf_fault(
-        "sampling.slices",
-        "samples keep out of a slice of azimuth, in degrees",
-        0.3,
-        "sample",
-        of_sample(around_slice),
-        quick=np.inf,
-    ),
-    bsdf_fault("sampling.dark", "no density in a slice of azimuth, in degrees", 0.3, "pdf", no_density),
-    bsdf_fault("sampling.still", "directions in stairs, in random numbers", 1e-5, "u", stairs_of),
-    bsdf_fault("sampling.integral", "density too large everywhere", 0.01, "pdf", larger),
-    bsdf_fault("weights.density", "density that a sample states too large", 3e-3, "sample", larger_pdf),
-    bsdf_fault("weights.weight", "weight of a sample too large", 3e-3, "sample", of_weight(larger)),
-    bsdf_fault("weights.weight", "weight of a sample in stairs", 3e-3, "sample", of_weight(weight_in_stairs)),
-    bsdf_fault(
-        "weights.discrete",
-        "probability of a single direction too small",
-        5e-3,
-        "sample",
-        smaller_pdf,
-        nested={"type": "conductor"},
-    ),
-    bsdf_fault(
-        "finite.samples",
-        "NaN for a share of the random numbers, at their end",
-        1e-6,
-        "sample",
-        of_weight(no_number_at_the_end),
-    ),
-    bsdf_fault(
-        "finite.million",
-        "NaN for a share of the random numbers, anywhere",
-        1e-6,
-        "sample",
-        of_weight(no_number),
-        quick=4e-6,
-    ),
+# Samples of BSDFs
+bsdf_fault(
+    "sampling.cells",
+    "density too large where a tenth of the samples go",
+    0.03,
+    quick=0.1,
+    pdf=in_tenth,
+)
+bsdf_fault("sampling.small", "density too small in a cone of 1 degree", 0.5, quick=np.inf, pdf=in_cone)
+bsdf_fault(
+    "sampling.slices",
+    "samples keep out of a slice of azimuth, in degrees",
+    0.3,
+    quick=np.inf,
+    sample=of_sample(around_slice),
+)
+bsdf_fault("sampling.dark", "no density in a slice of azimuth, in degrees", 0.3, pdf=no_density)
+bsdf_fault("sampling.still", "directions in stairs, in random numbers", 1e-5, u=stairs_of)
+bsdf_fault("sampling.integral", "density too large everywhere", 0.01, pdf=larger)
+bsdf_fault("weights.density", "density that a sample states too large", 3e-3, sample=larger_pdf)
+bsdf_fault("weights.weight", "weight of a sample too large", 3e-3, sample=of_weight(larger))
+bsdf_fault("weights.weight", "weight of a sample in stairs", 3e-3, sample=of_weight(weight_in_stairs))
+bsdf_fault(
+    "weights.discrete",
+    "probability of a single direction too small",
+    5e-3,
+    nested={"type": "conductor"},
+    sample=smaller_pdf,
+)
+bsdf_fault(
+    "finite.samples",
+    "NaN for a share of the random numbers, at their end",
+    1e-6,
+    sample=of_weight(no_number_at_the_end),
+)
+bsdf_fault(
+    "finite.million",
+    "NaN for a share of the random numbers, anywhere",
+    1e-6,
+    quick=4e-6,
+    sample=of_weight(no_number),
 )
 
-BSDF_VALUES = (
-    bsdf_fault("eval_pdf.value", "value of eval_pdf() too large in one channel", 1e-4, "pair", first_channel),
-    bsdf_fault(
-        "eval_pdf.density",
-        "density of eval_pdf() too large",
-        2e-4,
-        "pair",
-        density_of_pair,
-        nested=GLOSS,
-    ),
-    bsdf_fault("energy.largest", "albedo above 1", 0.01, "value", too_bright),
-    bsdf_fault("energy.apart", "value of eval() too large", 0.02, "eval", larger),
-    bsdf_fault("reciprocity.swapped", "value that grows with the cosine of wi", 3e-3, "value", with_cosine),
-    bsdf_fault("reciprocity.modes", "more light in the mode of importance", 3e-3, "value", by_mode),
-    bsdf_fault("reciprocity.medium", "index of refraction of reflected light", 3e-7, "sample", larger_eta),
-    bsdf_fault(
-        "reciprocity.single",
-        "more light through glass from one side",
-        3e-3,
-        "value",
-        from_one_side,
-        nested=GLASS,
-    ),
-    bsdf_fault(
-        "reciprocity.single_modes",
-        "more light through glass in the mode of importance",
-        3e-3,
-        "value",
-        by_mode,
-        nested=GLASS,
-    ),
-    bsdf_fault(
-        "finite.values",
-        "negative value where both cosines are so near to 1",
-        1e-6,
-        "value",
-        negative_next_to_normal,
-    ),
-    bsdf_fault("roundoff.lost", "stairs on a slope, of this height", 3e-4, "value", stairs_on_slope),
-    bsdf_fault("gradients.values", "derivative of values too large", 0.03, "value", steeper, nested=GLOSS),
-    bsdf_fault(
-        "gradients.weights",
-        "derivative of weights too large",
-        0.03,
-        "sample",
-        of_weight(steeper),
-        nested=GLOSS,
-    ),
-    bsdf_fault("components.sum", "a component brighter than its share", 1e-4, "eval", by_component),
-    bsdf_fault("components.masked", "lobes brighter where they are asked for by type", 1e-4, "eval", by_mask),
-    bsdf_fault("components.masked_samples", "types of lobes ignored", 1, "context", without_mask),
-    bsdf_fault("variants.same", "values larger in scalar variants", 3e-3, "value", by_variant),
+# Values of BSDFs
+bsdf_fault("eval_pdf.value", "value of eval_pdf() too large in one channel", 1e-4, pair=first_channel)
+bsdf_fault("eval_pdf.density", "density of eval_pdf() too large", 2e-4, nested=GLOSS, pair=density_of_pair)
+bsdf_fault("energy.largest", "albedo above 1", 0.01, value=too_bright)
+bsdf_fault("energy.apart", "value of eval() too large", 0.02, eval=larger)
+bsdf_fault("reciprocity.swapped", "value that grows with the cosine of wi", 3e-3, value=with_cosine)
+bsdf_fault("reciprocity.modes", "more light in the mode of importance", 3e-3, value=by_mode)
+bsdf_fault("reciprocity.medium", "index of refraction of reflected light", 3e-7, sample=larger_eta)
+bsdf_fault(
+    "reciprocity.single",
+    "more light through glass from one side",
+    3e-3,
+    nested=GLASS,
+    value=from_one_side,
+)
+bsdf_fault(
+    "reciprocity.single_modes",
+    "more light through glass in the mode of importance",
+    3e-3,
+    nested=GLASS,
+    value=by_mode,
+)
+bsdf_fault(
+    "finite.values",
+    "negative value where both cosines are so near to 1",
+    1e-6,
+    value=negative_next_to_normal,
+)
+bsdf_fault("roundoff.lost", "stairs on a slope, of this height", 3e-4, value=stairs_on_slope)
+bsdf_fault("gradients.values", "derivative of values too large", 0.03, nested=GLOSS, value=steeper)
+bsdf_fault(
+    "gradients.weights",
+    "derivative of weights too large",
+    0.03,
+    nested=GLOSS,
+    sample=of_weight(steeper),
+)
+bsdf_fault("components.sum", "a component brighter than its share", 1e-4, eval=by_component)
+bsdf_fault("components.masked", "lobes brighter where they are asked for by type", 1e-4, eval=by_mask)
+bsdf_fault("components.masked_samples", "types of lobes ignored", 1, context=without_mask)
+bsdf_fault("variants.same", "values larger in scalar variants", 3e-3, value=by_variant)
+
+# Hits of shapes
+shape_fault(
+    "hits.ray_test",
+    "ray_test() misses in this share of directions",
+    1e-5,
+    ray_test=missed_in_share,
+)
+shape_fault("surface.on_ray", "hit points off the ray, in sizes", 1e-5, ray_intersect=off_surface)
+shape_fault("surface.near_by", "hit points off, in sizes", 5e-7, ray_intersect=off_surface)
+shape_fault("surface.behind", "hits too far away, in sizes", 5e-7, ray_intersect=too_far)
+shape_fault(
+    "surface.missed",
+    "a least distance for this share of directions",
+    3e-3,
+    ray_intersect=missed(close),
+)
+shape_fault("normals.outwards", "normals inwards on this share of most faces", 3e-3, ray_intersect=inwards)
+shape_fault("normals.length", "normals too long", 3e-5, ray_intersect=member("n", larger))
+shape_fault("normals.slant", "normals tilted, in radians", 3e-3, ray_intersect=tilted_normal)
+shape_fault(
+    "normals.slope",
+    "normals tilted as well as derivatives, in radians",
+    0.03,
+    ray_intersect=tilted_normal,
+)
+shape_fault(
+    "normals.shading",
+    "shading normals tilted, in radians",
+    3e-3,
+    ray_intersect=member("sh_frame", tilted_frame),
+)
+shape_fault("normals.step", "dp_du too long", 0.02, ray_intersect=member("dp_du", larger))
+shape_fault(
+    "watertight.out",
+    "a slit of this width, in sizes",
+    3e-5,
+    quick=1e-4,
+    ray_intersect=missed(slit),
+)
+shape_fault(
+    "watertight.odd",
+    "a slit of this width in one face, in sizes",
+    6e-3,
+    ray_intersect=missed(slit_above),
+)
+shape_fault(
+    "far.missed",
+    "hits off by this part of a distance above a thousand",
+    1e-5,
+    ray_intersect=off_from_afar,
+)
+shape_fault(
+    "far.missed",
+    "misses from afar in this share of directions",
+    3e-3,
+    ray_intersect=missed(afar),
+)
+shape_fault(
+    "finite.bad",
+    "NaN where a component of the direction is so small",
+    1e-12,
+    ray_intersect=no_number_along_axis,
+)
+shape_fault(
+    "finite.million",
+    "NaN for a share of the rays",
+    2e-6,
+    quick=2e-5,
+    ray_intersect=no_number_in_place,
+)
+shape_fault("bbox.outside", "a box too small above, in sizes", 3e-5, bbox=lower_top)
+shape_fault("bbox.outside", "a box too small below, in sizes", 3e-5, bbox=higher_bottom)
+
+# Samples of shapes
+shape_fault(
+    "sampling.crossings",
+    "area too large, and the density of positions too small",
+    0.01,
+    quick=0.02,
+    surface_area=larger,
+    pdf_position=smaller,
+    sample_position=member("pdf", smaller),
+)
+shape_fault("sampling.area", "surface_area() too large", 3e-3, surface_area=larger)
+shape_fault("sampling.position", "pdf_position() too large", 3e-3, pdf_position=larger)
+shape_fault(
+    "sampling.spread",
+    "positions crowded to one side: u to the power of 1 and this",
+    0.03,
+    quick=0.1,
+    nested={"type": "rectangle"},
+    sample_position=crowded,
+)
+shape_fault(
+    "sampling.spread",
+    "positions on a sphere crowded at one azimuth: u to the power of 1 and this",
+    0.03,
+    quick=0.1,
+    nested={"type": "sphere"},
+    sample_position=crowded_azimuth,
+)
+shape_fault("sampling.off", "positions off the surface, in sizes", 1e-5, sample_position=off_surface)
+shape_fault("sampling.normal", "normals of positions tilted, in radians", 0.1, sample_position=tilted_normal)
+shape_fault("sampling.direction", "pdf_direction() too large", 0.02, pdf_direction=larger)
+shape_fault(
+    "sampling.misses",
+    "distances too short for this share of directions",
+    0.02,
+    sample_direction=too_short,
+)
+shape_fault(
+    "sampling.aim",
+    "directions to a sphere crowded at one azimuth: u to the power of 1 and this",
+    0.05,
+    quick=0.1,
+    nested={"type": "sphere"},
+    sample_direction=crowded_directions,
+)
+shape_fault(
+    "sampling.angle",
+    "density of directions too small",
+    0.03,
+    quick=0.2,
+    pdf_direction=smaller,
+    sample_direction=member("pdf", smaller),
 )
 
-SHAPE_HITS = (
-    shape_fault(
-        "hits.ray_test",
-        "ray_test() misses in this share of directions",
-        1e-5,
-        ray_test=missed_in_share,
-    ),
-    shape_fault("surface.on_ray", "hit points off the ray, in sizes", 1e-5, ray_intersect=off_surface),
-    shape_fault("surface.near_by", "hit points off, in sizes", 5e-7, ray_intersect=off_surface),
-    shape_fault("surface.behind", "hits too far away, in sizes", 5e-7, ray_intersect=too_far),
-    shape_fault(
-        "surface.missed",
-        "a least distance for this share of directions",
-        3e-3,
-        ray_intersect=missed(close),
-    ),
-    shape_fault(
-        "normals.outwards", "normals inwards on this share of most faces", 3e-3, ray_intersect=inwards
-    ),
-    shape_fault("normals.length", "normals too long", 3e-5, ray_intersect=member("n", larger)),
-    shape_fault("normals.slant", "normals tilted, in radians", 3e-3, ray_intersect=tilted_normal),
-    shape_fault(
-        "normals.slope",
-        "normals tilted as well as derivatives, in radians",
-        0.03,
-        ray_intersect=tilted_normal,
-    ),
-    shape_fault(
-        "normals.shading",
-        "shading normals tilted, in radians",
-        3e-3,
-        ray_intersect=member("sh_frame", tilted_frame),
-    ),
-    shape_fault("normals.step", "dp_du too long", 0.02, ray_intersect=member("dp_du", larger)),
-    shape_fault(
-        "watertight.out",
-        "a slit of this width, in sizes",
-        3e-5,
-        quick=1e-4,
-        ray_intersect=missed(slit),
-    ),
-    shape_fault(
-        "watertight.odd",
-        "a slit of this width in one face, in sizes",
-        6e-3,
-        ray_intersect=missed(slit_above),
-    ),
-    shape_fault(
-        "far.missed",
-        "hits off by this part of a distance above a thousand",
-        1e-5,
-        ray_intersect=off_from_afar,
-    ),
-    shape_fault(
-        "far.missed",
-        "misses from afar in this share of directions",
-        3e-3,
-        ray_intersect=missed(afar),
-    ),
-    shape_fault(
-        "finite.bad",
-        "NaN where a component of the direction is so small",
-        1e-12,
-        ray_intersect=no_number_along_axis,
-    ),
-    shape_fault(
-        "finite.million",
-        "NaN for a share of the rays",
-        2e-6,
-        quick=2e-5,
-        ray_intersect=no_number_in_place,
-    ),
-    shape_fault("bbox.outside", "a box too small above, in sizes", 3e-5, bbox=lower_top),
-    shape_fault("bbox.outside", "a box too small below, in sizes", 3e-5, bbox=higher_bottom),
+# A sky
+sky_fault(
+    "sampling.small",
+    "directions keep out of a cone, in degrees across",
+    3,
+    direction=around_hole,
 )
-
-SHAPE_SAMPLES = (
-    shape_fault(
-        "sampling.crossings",
-        "area too large, and the density of positions too small",
-        0.01,
-        quick=0.02,
-        surface_area=larger,
-        pdf_position=smaller,
-        sample_position=member("pdf", smaller),
-    ),
-    shape_fault("sampling.area", "surface_area() too large", 3e-3, surface_area=larger),
-    shape_fault("sampling.position", "pdf_position() too large", 3e-3, pdf_position=larger),
-    shape_fault(
-        "sampling.spread",
-        "positions crowded to one side: u to the power of 1 and this",
-        0.03,
-        quick=0.1,
-        nested={"type": "rectangle"},
-        sample_position=crowded,
-    ),
-    shape_fault(
-        "sampling.spread",
-        "positions on a sphere crowded at one azimuth: u to the power of 1 and this",
-        0.03,
-        quick=0.1,
-        nested={"type": "sphere"},
-        sample_position=crowded_azimuth,
-    ),
-    shape_fault("sampling.off", "positions off the surface, in sizes", 1e-5, sample_position=off_surface),
-    shape_fault(
-        "sampling.normal", "normals of positions tilted, in radians", 0.1, sample_position=tilted_normal
-    ),
-    shape_fault("sampling.direction", "pdf_direction() too large", 0.02, pdf_direction=larger),
-    shape_fault(
-        "sampling.misses",
-        "distances too short for this share of directions",
-        0.02,
-        sample_direction=too_short,
-    ),
-    shape_fault(
-        "sampling.aim",
-        "directions to a sphere crowded at one azimuth: u to the power of 1 and this",
-        0.05,
-        quick=0.1,
-        nested={"type": "sphere"},
-        sample_direction=crowded_directions,
-    ),
-    shape_fault(
-        "sampling.angle",
-        "density of directions too small",
-        0.03,
-        quick=0.2,
-        pdf_direction=smaller,
-        sample_direction=member("pdf", smaller),
-    ),
+sky_fault(
+    "sampling.dark",
+    "no density in a cone, in degrees across",
+    3,
+    direction=no_density_of_sample,
+    pdf=no_density_in_hole,
 )
+sky_fault("density.same", "pdf_direction() too large", 3e-3, pdf=larger)
+sky_fault("weights.weight", "weight of a sample too large", 3e-3, weight=larger)
+sky_fault("finite.million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number)
 
-SKIES = (
-    sky_fault(
-        "sampling.small",
-        "directions keep out of a cone, in degrees across",
-        3,
-        direction=around_hole,
-    ),
-    sky_fault(
-        "sampling.dark",
-        "no density in a cone, in degrees across",
-        3,
-        direction=no_density_of_sample,
-        pdf=no_density_in_hole,
-    ),
-    sky_fault("density.same", "pdf_direction() too large", 3e-3, pdf=larger),
-    sky_fault("weights.weight", "weight of a sample too large", 3e-3, weight=larger),
-    sky_fault("finite.million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number),
-)
-
-FAULTS: Sequence[Fault] = (*BSDF_SAMPLES, *BSDF_VALUES, *SHAPE_HITS, *SHAPE_SAMPLES, *SKIES)
 
 if __name__ == "__main__":  # the table of docs/check_your_plugin.md; inf: none was found
     register(runtime.SLOW, runtime.FAST)
