@@ -13,6 +13,7 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.target import Target
 
 Value = TypeVar("Value")
+Values = Mapping[str, Any]  # by the names of options or parameters
 
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
@@ -206,7 +207,7 @@ def check(name: str, kind: Kind, value: Any, *, text: bool = False) -> Any:
         raise UsageError(f"{name}={shown}: must be {kind.allowed}") from None
 
 
-def is_obj(scene: object, model: Mapping[str, Any]) -> bool:
+def is_obj(scene: object, model: Values) -> bool:
     """Whether a scene is given as the path of an OBJ file.
 
     Raises ``UsageError`` for options of a model where it is not.

@@ -22,6 +22,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import Budget, Workspace
+from mrt_mitsuba.options import Values
 from mrt_mitsuba.output import files
 from mrt_mitsuba.output.layers import AVERAGED
 from mrt_mitsuba.output.layers import TABLE as LAYER_TABLE
@@ -51,7 +52,7 @@ class Result:
     timings: Timings  #: seconds
     rays: Mapping[str, int]  #: number by kind; "mirror" and "shadow" only where they were counted
     kernel_launches: int  #: how many kernels ran
-    options: Mapping[str, Any]  #: the values in force
+    options: Values  #: the values in force
     versions: Mapping[str, str]  #: of what decides about pixels
     camera: Mapping[str, np.ndarray]  #: float64 [4, 4], see ``shading.camera_matrices``
     inputs: frozenset[str] = frozenset()  #: paths of the files that the scene was read from

@@ -15,7 +15,7 @@ from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import check, choice
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.scene.loading import load_file
-from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Scene
+from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Node, Scene
 from mrt_mitsuba.scene.open import in_terms
 from mrt_mitsuba.scene.report import report_scene
 
@@ -30,7 +30,7 @@ STOCK_EXTENT = 100.0
 
 def scene_dict(
     scene: int | Scene, *, width: int = 800, height: int = 600, fresnel: str = "schlick", flavor: str = "mrt"
-) -> dict[str, Any]:
+) -> Node:
     """A scene as a plain Mitsuba dict; ``mi.load_dict`` takes it (after ``mrt.register()``).
 
     ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
@@ -76,7 +76,7 @@ def write_xml(
     check("flavor", choice(*FLAVORS), flavor)
     terms = in_terms(scene, model)
     files: dict[str, bytes] = {}  # of shapes, by their paths
-    focus: dict[str, Any] = {}  # what Mitsuba's cameras have no parameters for, and ``render`` reads
+    focus: dict[str, object] = {}  # what Mitsuba's cameras have no parameters for, and ``render`` reads
     if terms is None and isinstance(scene, str | os.PathLike):
         given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor == "stock"}
         for name, value in given.items():
@@ -91,8 +91,9 @@ def write_xml(
         raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
     else:
         terms = terms or report_scene(scene)  # type: ignore[arg-type]  # which refuses anything else
-        size: Any = {"width": width or SIZE[0], "height": height or SIZE[1]}
-        nodes = scene_dict(terms, fresnel=fresnel or "schlick", **size)
+        nodes = scene_dict(
+            terms, fresnel=fresnel or "schlick", width=width or SIZE[0], height=height or SIZE[1]
+        )
         files = _put_into_files(nodes, os.path.splitext(os.fspath(path))[0], flavor)
         nodes = _stock(nodes, terms) if flavor == "stock" else nodes
         import mitsuba as mi
@@ -113,7 +114,7 @@ def write_xml(
     return [*files, os.fspath(path)]
 
 
-def _put_into_files(nodes: dict[str, Any], stem: str, flavor: str) -> dict[str, bytes]:
+def _put_into_files(nodes: Node, stem: str, flavor: str) -> dict[str, bytes]:
     """Replace shapes that are meshes by readers of binary PLY files; return these by their paths."""
     import mitsuba as mi
 
@@ -136,9 +137,9 @@ def _put_into_files(nodes: dict[str, Any], stem: str, flavor: str) -> dict[str, 
     return files
 
 
-def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
+def _stock(nodes: Node, scene: Scene) -> Node:
     """Replace every plugin of this project by its nearest stock equivalent, which may take several nodes."""
-    result: dict[str, Any] = {}
+    result: Node = {}
     for name, node in nodes.items():
         kind = node["type"] if isinstance(node, dict) else ""
         result[name] = node
@@ -169,7 +170,7 @@ def _stock(nodes: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
     return result
 
 
-def _stock_bsdf(node: dict[str, Any]) -> dict[str, Any]:
+def _stock_bsdf(node: Node) -> Node:
     """``roughplastic``, or ``diffuse`` where nothing is reflected; no colour exceeds 1."""
     colors = {name: dict(node[name]) for name in ("diffuse_reflectance", "specular_reflectance")}
     for color in colors.values():

@@ -17,7 +17,6 @@ import contextlib
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
 
 import mitsuba as mi
 
@@ -25,6 +24,7 @@ from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home, two_threads
+from mrt_mitsuba.options import Values
 from mrt_mitsuba.scene.files import DEEPEST, elements, picture_size, require_file
 
 MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
@@ -39,8 +39,8 @@ _ORIGIN = re.compile(
 
 
 def load_dict(
-    scene: Mapping[str, Any], name: str = "the dict", budget: Budget | None = None, *, merge: bool = True
-) -> Any:
+    scene: Values, name: str = "the dict", budget: Budget | None = None, *, merge: bool = True
+) -> mi.Object:
     """Load a Mitsuba dict: a scene, or any other object.
 
     ``merge``: make one of meshes of the same material, as Mitsuba does, which leaves them in any order.
@@ -55,8 +55,8 @@ def load_dict(
 
 
 def load_file(
-    path: str, parameters: Mapping[str, Any], budget: Budget | None = None, *, as_text: bool = False
-) -> tuple[Any, Mapping[str, str]]:
+    path: str, parameters: Values, budget: Budget | None = None, *, as_text: bool = False
+) -> tuple[mi.Object | str, Mapping[str, str]]:
     """The scene of an XML file, and its ``$parameters`` with the values given, or the defaults.
 
     ``as_text``: return it as XML, with includes and parameters filled in, and files by their whole path.
@@ -82,7 +82,7 @@ def load_file(
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------
 
 
-def _check_nodes(nodes: Iterable[Any], budget: Budget) -> None:
+def _check_nodes(nodes: Iterable[mi.parser.SceneNode], budget: Budget) -> None:
     """Look at all that Mitsuba would load for what it has parsed."""
     mitsuba_first()  # a <path> of the file puts its folder before
     for node in nodes:
@@ -99,7 +99,7 @@ def _check_nodes(nodes: Iterable[Any], budget: Budget) -> None:
                 budget.take_texture(file, *size, around=kind == "envmap")
 
 
-def _instantiate(state: Any, merge: bool = True) -> Any:
+def _instantiate(state: mi.parser.ParserState, merge: bool = True) -> mi.Object:
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False
     config.merge_meshes = merge
@@ -151,7 +151,7 @@ def _check_data(filename: str, inputs: set[str]) -> str:
     return path
 
 
-def _check_dict(node: Mapping[str, Any], inputs: set[str], place: str = "", depth: int = 1) -> None:
+def _check_dict(node: Values, inputs: set[str], place: str = "", depth: int = 1) -> None:
     """Look at every entry. None, cycles and depth would end the process."""
     if depth > DEEPEST:
         raise RuntimeError(f"it is nested more than {DEEPEST} levels deep")

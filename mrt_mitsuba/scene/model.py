@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 Color = tuple[float, float, float]
+Node = dict[str, Any]  # an object as ``mi.load_dict`` takes it
 
 # The sky of most scenes of the report
 BLUE_SKY: Color = (0.2, 0.2, 0.7)
@@ -149,7 +150,7 @@ class Scene:
     title: str = field(default="", compare=False)
     files: frozenset[str] = field(default=frozenset(), compare=False)  #: that it was read from
 
-    def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> dict[str, Any]:
+    def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> Node:
         """The scene as a Mitsuba dict of this project's plugins, with materials shared by reference.
 
         Raises ``SceneError`` for a camera, a sky or an object of numbers that make no sense.
@@ -160,7 +161,7 @@ class Scene:
         def bsdf(material: Material) -> dict[str, str]:
             return {"type": "ref", "id": names.setdefault(material, f"material_{len(names)}")}
 
-        shapes: dict[str, Any] = {}
+        shapes: Node = {}
         for kind, plugin in PLUGINS.items():
             things = getattr(self, f"{kind}s")
             many = len(things) > MOST_SINGLE.get(kind, math.inf)
@@ -175,7 +176,7 @@ class Scene:
                 shapes[f"{kind}s"] = {**shape, "bsdf": own or bsdf(grouped[0].material)}
         for i, m in enumerate(self.meshes):
             shapes[f"mesh_{i}"] = {**_mesh(m, self.texturing), "bsdf": bsdf(m.material)}
-        result: dict[str, Any] = {"type": "scene"}
+        result: Node = {"type": "scene"}
         if self.meshes:  # by default, Embree lets rays through between slivers
             result["embree_use_robust_intersections"] = True
         result["integrator"] = {"type": "mrt_whitted"}
@@ -221,7 +222,7 @@ def _check(scene: Scene) -> None:
                 raise SceneError(f"{kind}s[{i}] is {thing!r}, but must have finite places and a radius > 0")
 
 
-def _sensor(camera: Camera, width: int, height: int) -> dict[str, Any]:
+def _sensor(camera: Camera, width: int, height: int) -> Node:
     """The camera as a Mitsuba dict, with a film for a size in pixels."""
     import mitsuba as mi
 
@@ -241,11 +242,11 @@ def _sensor(camera: Camera, width: int, height: int) -> dict[str, Any]:
     }
 
 
-def _rgb(color: Color) -> dict[str, Any]:
+def _rgb(color: Color) -> Node:
     return {"type": "rgb", "value": list(color)}
 
 
-def _group(kind: str, objects: list, fresnel: str) -> tuple[dict[str, Any], dict[str, Any] | None]:
+def _group(kind: str, objects: list, fresnel: str) -> tuple[Node, Node | None]:
     """One shape of many objects, and a BSDF that looks up values by object if they differ, else None."""
     import mitsuba as mi
     import numpy as np
@@ -267,7 +268,7 @@ def _group(kind: str, objects: list, fresnel: str) -> tuple[dict[str, Any], dict
     return {"type": "mrt_group", "kind": kind, **bitmaps}, bsdf
 
 
-def _mesh(m: Mesh, texturing: str) -> dict[str, Any]:
+def _mesh(m: Mesh, texturing: str) -> Node:
     import mitsuba as mi
     import numpy as np
 
@@ -287,7 +288,7 @@ def _mesh(m: Mesh, texturing: str) -> dict[str, Any]:
 _SMALLEST_IOR = 1e-8
 
 
-def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> dict[str, Any]:
+def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> Node:
     diffuse = _rgb(m.diffuse)
     if m.texture is not None:  # looked up as in the report, or as by Mitsuba: bilinear, sRGB-aware, repeated
         kind = "mrt_texture" if texturing == "report" else "bitmap"

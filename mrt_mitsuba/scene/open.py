@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.machine import Budget
-from mrt_mitsuba.options import is_obj
+from mrt_mitsuba.options import Values, is_obj
 from mrt_mitsuba.plugins.variants import text_of
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene
@@ -49,8 +49,8 @@ def open_scene(
     integrator: object = None,
     budget: Budget | None = None,
     sensor: int = 0,
-    params: Mapping[str, Any] | None = None,
-    model: Mapping[str, Any] | None = None,
+    params: Values | None = None,
+    model: Values | None = None,
 ) -> Source:
     """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``.
 
@@ -88,8 +88,9 @@ def open_scene(
         name, loaded, values = _loaded(scene, budget, declared)
         if keys and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
-        distance = _number(values, "focaldist", None)  # as write_xml writes it
-        reach = _number(values, "focalrange", FOCAL_RANGE)
+        distance = _number(values, "focaldist")
+        declared_reach = _number(values, "focalrange")
+        reach = FOCAL_RANGE if declared_reach is None else declared_reach
     set_parameters(loaded, keys)
     source = opened(name, loaded, _sensor(name, loaded, sensor), _integrator(integrator, loaded))
     return replace(
@@ -103,7 +104,7 @@ def open_scene(
     )
 
 
-def in_terms(scene: Any, model: Mapping[str, Any]) -> Scene | None:
+def in_terms(scene: Any, model: Values) -> Scene | None:
     """A number, a ``Scene`` or the path of an OBJ file in the report's terms; None for anything else.
 
     ``model``: options of ``obj_scene``. Raises ``UsageError`` where they are of no use.
@@ -117,7 +118,7 @@ def in_terms(scene: Any, model: Mapping[str, Any]) -> Scene | None:
     return scene if isinstance(scene, Scene) else None
 
 
-def set_parameters(scene: mi.Scene, values: Mapping[str, Any]) -> None:
+def set_parameters(scene: mi.Scene, values: Values) -> None:
     """Set values by their ``mi.traverse`` key; raise ``UsageError`` for unknown ones and wrong types."""
     if not values:
         return
@@ -153,7 +154,7 @@ def sized(source: Source) -> Iterator[None]:
 
 
 def _loaded(
-    scene: object, budget: Budget | None, declared: Mapping[str, Any]
+    scene: object, budget: Budget | None, declared: Values
 ) -> tuple[str, mi.Scene, Mapping[str, str]]:
     """The name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
     if isinstance(scene, dict):
@@ -177,12 +178,12 @@ def _check_variant(name: str, thing: object) -> None:
         )
 
 
-def _number(values: Mapping[str, str], name: str, default: float | None) -> Any:
-    """A number that an XML file declares, or the default."""
+def _number(values: Mapping[str, str], name: str) -> float | None:
+    """A number that an XML file declares, as ``write_xml`` writes it."""
     try:
         return max(0.0, float(values[name]))
     except (KeyError, ValueError):
-        return default
+        return None
 
 
 def _sensor(name: str, scene: mi.Scene, number: int) -> mi.Sensor:

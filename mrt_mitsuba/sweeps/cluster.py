@@ -22,6 +22,7 @@ from distributed.system import MEMORY_LIMIT
 from mrt_mitsuba.errors import MrtError, OutputError, one_line
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.sweeps import worker
+from mrt_mitsuba.sweeps.folder import Facts
 from mrt_mitsuba.sweeps.jobs import Job
 
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
@@ -143,7 +144,7 @@ def inspect(client: Client, scratch: str, here: str) -> dict[str, int]:
 
 def outcomes(
     client: Client, jobs: Sequence[Job], retries: int, scratch: str, **setting: Any
-) -> Generator[tuple[Job, dict[str, Any]], None, None]:
+) -> Generator[tuple[Job, Facts], None, None]:
     """Let workers render jobs, and yield each as it ends, with its facts or its "error".
 
     One that lost its worker, or failed by accident, is handed over again. ``setting``: of ``render_job``.

@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex
 
 import mitsuba as mi
+import numpy as np
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.options import Values
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.runtime import use, versions
 from mrt_mitsuba.scene.files import require_file
@@ -33,7 +35,7 @@ class Job(NamedTuple):
 
     name: str  #: of its file, without ending
     scene: Any
-    arguments: Mapping[str, Any]  #: of ``render``, without the scene
+    arguments: Values  #: of ``render``, without the scene
     identity: str = ""  #: fingerprint of the scene
 
     @property
@@ -62,7 +64,7 @@ class Job(NamedTuple):
         return fingerprint(self.identity, pixels, versions())
 
 
-def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
+def points(grid: object, zipped: bool) -> dict[str, Values]:
     """The values of each job by their axes, by the name of its file; the last axis varies fastest.
 
     ``zipped``: the axes are columns of one list, whose rows are the jobs, and files are numbered.
@@ -92,11 +94,11 @@ def points(grid: Any, zipped: bool) -> dict[str, dict[str, Any]]:
     return dict(zip(names, combinations, strict=True))
 
 
-def _name(point: Mapping[str, Any]) -> str:
+def _name(point: Values) -> str:
     return ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture"
 
 
-def _axis(key: Any, values: Any) -> list[Any]:
+def _axis(key: object, values: Any) -> list[Any]:
     values = values.tolist() if hasattr(values, "tolist") else values  # NumPy's
     if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
         raise UsageError(f"grid: {key} is {values!r}; give a list of values, such as [{values!r}]")
@@ -106,7 +108,7 @@ def _axis(key: Any, values: Any) -> list[Any]:
     return [value.tolist() if hasattr(value, "tolist") else value for value in first]
 
 
-def word(value: Any) -> str:
+def word(value: object) -> str:
     """A value in letters that file names may have."""
     if isinstance(value, list | tuple):
         return "x".join(map(word, value)) or "none"
@@ -119,9 +121,7 @@ def word(value: Any) -> str:
     return re.sub(r"[^\w.+-]+", "-", str(value).replace("%", "pct"))
 
 
-def jobs(
-    scene: Any, named: Mapping[str, Mapping[str, Any]], fixed: Mapping[str, Any], folder: str
-) -> list[Job]:
+def jobs(scene: Any, named: Mapping[str, Values], fixed: Values, folder: str) -> list[Job]:
     """The job of each point, given what all share, with scenes as workers can open them: numbers and absolute
     paths. Any other scene is written into a folder.
 
@@ -146,7 +146,15 @@ def jobs(
         if params:
             arguments["params"] = params
         if id(own) not in scenes:
-            sent = _send(own, os.path.join(folder, f"{len(scenes)}{SENT}"))
+            sent: Any = own
+            if isinstance(own, str | os.PathLike):
+                sent = os.path.abspath(own)
+            elif isinstance(own, SupportsIndex):
+                sent = operator.index(own)
+                report_scene(sent)  # refuses a number without a scene
+            else:
+                sent = os.path.join(folder, f"{len(scenes)}{SENT}")
+                Path(sent).write_bytes(_encode(own))
             scenes[id(own)] = sent, identify(sent)
         sent, identity = scenes[id(own)]
         every.append(Job(name, sent, arguments, identity))
@@ -168,25 +176,15 @@ def check_parameters(jobs: Sequence[Job]) -> None:
 # ------------------------------------- Scenes on their way to workers ------------------------------------
 
 
-def _send(scene: Any, path: str) -> Any:
-    if isinstance(scene, str | os.PathLike):
-        return os.path.abspath(scene)
-    if isinstance(scene, SupportsIndex):
-        number = operator.index(scene)
-        report_scene(number)  # refuses a number without a scene
-        return number
-    Path(path).write_bytes(_encode(scene))
-    return path
-
-
-def receive(scene: Any) -> Any:
+def receive(scene: object) -> Any:
     """The scene that was sent."""
     use()  # it may hold Mitsuba's types
-    sent = isinstance(scene, str) and scene.endswith(SENT)
-    return pickle.loads(Path(scene).read_bytes()) if sent else scene
+    if isinstance(scene, str) and scene.endswith(SENT):
+        return pickle.loads(Path(scene).read_bytes())
+    return scene
 
 
-def identify(sent: Any) -> str:
+def identify(sent: object) -> str:
     """The fingerprint of a scene that was sent: of a file, that of its contents, not of the files that it
     names. Raises ``SceneError`` for a file that cannot be read."""
     if isinstance(sent, str):
@@ -195,12 +193,12 @@ def identify(sent: Any) -> str:
     return fingerprint(sent)
 
 
-def fingerprint(*values: Any) -> str:
+def fingerprint(*values: object) -> str:
     """32 letters that differ where the values do."""
     return hashlib.sha256(_encode(values)).hexdigest()[:32]
 
 
-def _encode(value: Any) -> bytes:
+def _encode(value: object) -> bytes:
     """A value of Python's and NumPy's types as bytes, the same for equal values.
 
     Raises ``UsageError`` for what lives in this process only, such as a loaded Mitsuba scene.
@@ -222,8 +220,6 @@ class _Pickler(pickle.Pickler):
     """Pickles Mitsuba's transforms and bitmaps by their numbers, too."""
 
     def reducer_override(self, value: Any) -> Any:
-        import numpy as np
-
         if "Transform4" in type(value).__name__:
             return _transform, (np.array(value.matrix, np.float64).reshape(4, 4),)
         if isinstance(value, mi.Bitmap):
@@ -231,11 +227,12 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def _transform(matrix: Any) -> Any:  # its class has another name where a scalar variant was set first
+# Its class has another name where a scalar variant was set first
+def _transform(matrix: np.ndarray) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(matrix)
 
 
-def _bitmap(pixels: Any, srgb: bool) -> Any:
+def _bitmap(pixels: np.ndarray, srgb: bool) -> mi.Bitmap:
     bitmap = mi.Bitmap(pixels)
     bitmap.set_srgb_gamma(srgb)
     return bitmap

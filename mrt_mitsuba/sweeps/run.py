@@ -13,7 +13,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
 from mrt_mitsuba.options import check, integer
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-from mrt_mitsuba.sweeps.folder import read_note, reserved
+from mrt_mitsuba.sweeps.folder import Facts, read_note, reserved
 from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, points
 from mrt_mitsuba.sweeps.pictures import cut, is_fresh, join
 from mrt_mitsuba.sweeps.table import Table
@@ -108,8 +108,8 @@ def sweep(
             if job.name not in parts:
                 known = table.earlier.get(job.file, {})
                 table.add(job.name, known | {"file": job.file, "error": "", "versions": versions})
-        made: dict[str, dict[str, Any]] = {}
-        ending: Iterator[tuple[Job, dict[str, Any]]] = iter(())
+        made: dict[str, Facts] = {}
+        ending: Iterator[tuple[Job, Facts]] = iter(())
         with ExitStack() as stack:
             if missing:
                 variant = options.get("variant") or ""

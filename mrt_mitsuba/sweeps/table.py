@@ -9,10 +9,11 @@ import os
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
 
 from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.options import Values
 from mrt_mitsuba.output.replacing import check_target, replacing
+from mrt_mitsuba.sweeps.folder import Facts
 from mrt_mitsuba.sweeps.jobs import word
 
 FACTS = {"file": str, "error": str, "seconds": float, "rays": int, "rmse": float, "attempts": int}
@@ -30,18 +31,18 @@ class Table:
     Raises ``OutputError`` for a ``table.csv`` that no sweep made, or that cannot be written.
     """
 
-    def __init__(self, folder: str, points: Mapping[str, Mapping[str, Any]]) -> None:
+    def __init__(self, folder: str, points: Mapping[str, Values]) -> None:
         self.folder = folder
         self.keys = tuple(next(iter(points.values()), ()))
         self._points = points
-        self._ended: dict[str, dict[str, Any]] = {}
+        self._ended: dict[str, Facts] = {}
         self._path = os.path.join(folder, "table.csv")
         self._written = 0.0
         check_target(self._path)
         self.earlier = _read(self._path)
 
     @property
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[Facts]:
         """A dict for each job that ended, in the order of the grid.
 
         Its parameters by key, then "file" (its name in the folder, "" without one), "error" ("" without one),
@@ -52,7 +53,7 @@ class Table:
         return [self._ended[name] for name in self._points if name in self._ended]
 
     @property
-    def failed(self) -> list[dict[str, Any]]:
+    def failed(self) -> list[Facts]:
         """The rows of jobs that left no picture."""
         return [row for row in self.rows if row["error"]]
 
@@ -60,7 +61,7 @@ class Table:
         made = len(self._ended) - len(self.failed)
         return f"{made} of {len(self._points)} pictures in {self.folder}"
 
-    def add(self, name: str, facts: Mapping[str, Any]) -> None:
+    def add(self, name: str, facts: Facts) -> None:
         """Add the row of a job that ended; the file follows once in a while."""
         self._ended[name] = {**self._points[name], **dict.fromkeys(FACTS), "file": "", "error": "", **facts}
         if time.monotonic() > self._written + PAUSE:
@@ -76,13 +77,13 @@ class Table:
         self._written = time.monotonic()
 
 
-def _cell(value: Any) -> Any:
+def _cell(value: object) -> str | float | None:
     if isinstance(value, str | float | int | None):
         return value
     return json.dumps(value, default=word) if isinstance(value, list | tuple) else word(value)
 
 
-def _read(path: str) -> dict[str, dict[str, Any]]:
+def _read(path: str) -> dict[str, Facts]:
     """The facts of an earlier table by the name of the file."""
     if not os.path.exists(path):
         return {}
@@ -90,7 +91,7 @@ def _read(path: str) -> dict[str, dict[str, Any]]:
         head, *rows = (row for row in csv.reader(file) if row)
         for names in ([*FACTS], BEFORE_CHECKSUMS):
             if head[-len(names) :] == names:
-                facts: dict[str, dict[str, Any]] = {}
+                facts: dict[str, Facts] = {}
                 for row in rows:  # its last columns have these names
                     texts = dict(zip(names, row[-len(names) :], strict=True))
                     known = {name: FACTS[name](text) for name, text in texts.items() if text}

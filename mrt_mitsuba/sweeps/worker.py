@@ -8,7 +8,6 @@ import socket
 import sys
 import time
 from collections.abc import Mapping
-from typing import Any
 
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -20,12 +19,12 @@ from mrt_mitsuba.options import SMALLEST_MEMORY
 from mrt_mitsuba.output.files import save, to_8bit
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.sweeps.folder import read_note, write_note
+from mrt_mitsuba.sweeps.folder import Facts, read_note, write_note
 from mrt_mitsuba.sweeps.jobs import Job, identify, receive
 from mrt_mitsuba.sweeps.pictures import MADE_WITH, checksum
 
 
-def describe(folder: str) -> dict[str, Any]:
+def describe(folder: str) -> Facts:
     """What a client asks each worker before it begins: the versions of all that decides about pixels, a name
     for its cores, the same for workers that share them, and whether it sees a folder."""
     versions = {**runtime.versions(), "python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
@@ -36,7 +35,7 @@ def describe(folder: str) -> dict[str, Any]:
     }
 
 
-def outcome(job: Job, scratch: str) -> dict[str, Any]:
+def outcome(job: Job, scratch: str) -> Facts:
     """The facts that workers have noted of a job: "attempts", and those of the last if it has ended.
 
     Notes outlive workers: one may die of its next job before Dask has reported on this.
@@ -82,7 +81,7 @@ def render_job(
         write_note(note, facts)
 
 
-def _render(job: Job, folder: str, scratch: str, png: bool, threads: int, limit: Any) -> dict[str, Any]:
+def _render(job: Job, folder: str, scratch: str, png: bool, threads: int, limit: int | None) -> Facts:
     start = time.perf_counter()
     import drjit as dr
 
