@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -299,7 +299,7 @@ def roundoff(law: Law, case: Case) -> None:
 
     for name, function in (("eval", brightest), ("pdf", case.pdf)):
 
-        def at(x: Array, function: Any = function) -> Array:
+        def at(x: Array, function: Callable[..., Array] = function) -> Array:
             return function(x[:, :3], x[:, 3:], np.tile(few.uv, (len(x) // len(few.uv), 1)))
 
         estimate = noise.measure(at, inputs, seed=case.seed, project=_both_unit)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cached_property
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -135,7 +134,7 @@ class Case(Subject):
     def sample(self, points: Array) -> Lanes:
         """A sample for each point; ``again``: pdf_direction(), ``value``: eval_direction()."""
 
-        def call(p: mi.Point3f, u: mi.Point2f) -> list[Any]:
+        def call(p: mi.Point3f, u: mi.Point2f) -> list[mi.Float]:
             it = _seen_from(p)
             ds, weight = self.plugin.sample_direction(it, u)
             value = self.plugin.eval_direction(it, ds)
@@ -154,7 +153,7 @@ class Case(Subject):
     def seen(self, d: Array) -> list[Array]:
         """The density of directions [N] and the light that is seen there [N, channels]."""
 
-        def call(d: mi.Vector3f) -> list[Any]:
+        def call(d: mi.Vector3f) -> list[mi.Float]:
             it = _seen_from(mi.Point3f(*map(float, self.points[0])))
             ds, _ = self.plugin.sample_direction(it, mi.Point2f(0.5))
             ds.d = d

@@ -38,7 +38,7 @@ ONE_IN_A_MILLION = "one false alarm in a million checks"
 SIGMAS = 6  # the same for a normal distribution: 2e-9
 Found = TypeVar("Found")
 Description = dict[str, Any]  # of a plugin, as ``mi.load_dict`` takes it
-Given = Any  # such a dict, or a loaded plugin
+Given = Any  # such a dict, a value of one, or a loaded plugin
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
 NOWHERE = Lanes()
 TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
@@ -437,7 +437,7 @@ def refused(description: Description) -> str:
     return _refusal(lines)
 
 
-def _kept(value: Any) -> Any:
+def _kept(value: Given) -> Given:
     if isinstance(value, dict):
         return {key: _kept(entry) for key, entry in value.items()}
     if hasattr(value, "matrix") and hasattr(value, "inverse_transpose"):
@@ -445,13 +445,13 @@ def _kept(value: Any) -> Any:
     return Kept("TensorXf", np.array(value)) if type(value).__name__.startswith("TensorX") else value
 
 
-def _made(value: Any) -> Any:
+def _made(value: Given) -> Given:
     if isinstance(value, dict):
         return {key: _made(entry) for key, entry in value.items()}
     return getattr(mi, value.kind)(value.values) if isinstance(value, Kept) else value
 
 
-def _written(value: Any) -> str:
+def _written(value: object) -> str:
     """A value as Python text; float32 in the fewest digits that give it back."""
     if isinstance(value, np.ndarray):
         inner = ", ".join(str(x) for x in value.astype(np.float32))

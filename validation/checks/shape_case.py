@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -49,7 +48,7 @@ def trace(target: mi.Scene, o: Array, d: Array) -> Lanes:
     ``steep``: met, and not in passing.
     """
 
-    def call(origin: mi.Point3f, direction: mi.Vector3f) -> list[Any]:
+    def call(origin: mi.Point3f, direction: mi.Vector3f) -> list[mi.Float]:
         si = target.ray_intersect(mi.Ray3f(origin, direction))
         return [si.is_valid(), si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv, si.prim_index]
 
@@ -144,7 +143,7 @@ class Case(Subject):
         """Sampled positions: points, normals, densities stated and asked for; their ``u``; and the area."""
         u = self.uniform(self.count(2**14, 2**19), 2)
 
-        def sample(second: mi.Point2f) -> list[Any]:
+        def sample(second: mi.Point2f) -> list[mi.Float]:
             ps = self.plugin.sample_position(0, second)
             return [ps.p, ps.n, ps.pdf, self.plugin.pdf_position(ps)]
 

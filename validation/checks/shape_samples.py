@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -224,7 +223,7 @@ def _directions(law: Law, case: Case, u: Array) -> None:
 def _sampled(case: Case, o: Array, u: Array) -> list[Array]:
     """Sampled directions from points [N, 3]: directions, distances, and densities stated and asked for."""
 
-    def sample(origin: mi.Point3f, second: mi.Point2f) -> list[Any]:
+    def sample(origin: mi.Point3f, second: mi.Point2f) -> list[mi.Float]:
         it = dr.zeros(mi.Interaction3f)
         it.p = origin
         ds = case.plugin.sample_direction(it, second)

@@ -100,10 +100,12 @@ def judge(
     return error, np.select([~off, silhouette, shadow, error <= spread], [-1, 0, 1, 2], 3)
 
 
-def draw(scene: Any, size: Any, *, fresnel: str = "dielectric", **integrator: Any) -> np.ndarray:
+def draw(
+    scene: Scene | int, size: tuple[int, int], *, fresnel: str = "dielectric", **integrator: Any
+) -> np.ndarray:
     """Our picture, one sample per pixel, with no path cut short."""
     settings = {"type": "mrt_whitted", "min_contribution": 0.0, **integrator}
-    options = {"width": size[0], "height": size[1], "aa": 1, "aamode": "none", "focaldist": 0}
+    options: Values = {"width": size[0], "height": size[1], "aa": 1, "aamode": "none", "focaldist": 0}
     return mrt.render(scene, **options, fresnel=fresnel, integrator=settings).image
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from mrt_mitsuba.validation.checks.probe import Array, Probe, direction, unit
 
 
-def rgb(value: float | Sequence[float]) -> dict[str, Any]:
+def rgb(value: float | Sequence[float]) -> dict[str, object]:
     """A colour, or a grey, as a Mitsuba dict."""
     return {"type": "rgb", "value": value if isinstance(value, float | int) else list(value)}
 

@@ -21,6 +21,7 @@ from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.api import Result
 
 Array = np.ndarray
+Picture = Any  # the path of an EXR, an array or the result of a render
 ORDER = "RGBXYZUVA"  # of channels within a layer; others follow
 ROUNDING = 1e-5  # relative size of differences that are float32's: sums in another order, fused operations
 EPSILON = 0.01  # keeps black pixels, which no relative error describes, from ruling it
@@ -98,7 +99,7 @@ class Difference:
         return f"<pre>{html.escape(str(self))}</pre>"
 
 
-def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference:
+def compare(a: Picture, b: Picture, layer: str = "", *, peak: float = 1.0) -> Difference:
     """Compare a picture with a reference.
 
     Args:
@@ -144,7 +145,7 @@ def compare(a: Any, b: Any, layer: str = "", *, peak: float = 1.0) -> Difference
 Layer = tuple[Array, Array | None, tuple[int, ...]]
 
 
-def read_layer(source: Any, layer: str = "", name: str = "the picture") -> Layer:
+def read_layer(source: Picture, layer: str = "", name: str = "the picture") -> Layer:
     """The picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)

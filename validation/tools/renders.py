@@ -32,7 +32,7 @@ Render = Callable[..., Any]
 # ----------------------------------------- Scenes of many things -----------------------------------------
 
 
-def load(nodes: Nodes) -> Any:
+def load(nodes: Nodes) -> mi.Scene:
     """A Mitsuba scene of a dict with our plugins."""
     mrt.register()
     return mi.load_dict(nodes)

@@ -17,6 +17,7 @@ from mrt_mitsuba.validation.tools.bsdf_probe import rgb
 
 Node = dict[str, Any]
 Point = list[float]
+Color = float | tuple[float, float, float]
 
 # One ray at a time through the pixel's centre, as the report's lattice has it
 AT_CENTRES: Node = {"aa": 1, "aamode": "none", "lattice": "report"}
@@ -69,7 +70,7 @@ def ball_scene(bsdf: Node, *, size: int = 96) -> mi.Scene:
 LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
 
 
-def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> Any:
+def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> mi.Scene:
     """A scene by name, at a size; ``film`` and further nodes replace its own."""
     nodes = SCENES[name]()
     size = {"width": width, "height": height}
@@ -82,7 +83,7 @@ def load(name: str, width: int, height: int, *, film: Node | None = None, **more
     return mi.load_dict({"type": "scene", "integrator": path, **nodes} | more)
 
 
-def _to() -> Any:
+def _to() -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f()
 
 
@@ -93,11 +94,11 @@ def _checks(count: int) -> Node:
     return {"type": "diffuse", "reflectance": board}
 
 
-def _diffuse(color: Any) -> Node:
+def _diffuse(color: Color) -> Node:
     return {"type": "diffuse", "reflectance": rgb(color)}
 
 
-def _rectangle(place: Any, **more: Node) -> Node:
+def _rectangle(place: mi.ScalarTransform4f, **more: Node) -> Node:
     return {"type": "rectangle", "to_world": place, **more}
 
 
@@ -122,7 +123,7 @@ def _lamp(center: Point, radius: float, radiance: float) -> Node:
     return {"type": "sphere", "center": center, "radius": radius, "emitter": emitter}
 
 
-def _sky(color: Any) -> Node:
+def _sky(color: Color) -> Node:
     return {"type": "constant", "radiance": rgb(color)}
 
 

@@ -36,6 +36,7 @@ from mrt_mitsuba.rendering.progress import Progress
 VALIDATION = "Validation of mrt-mitsuba"
 Values = dict[str, Any]  # by name: a row of a table, options, what describes a picture
 Item = TypeVar("Item")
+Run = Callable[..., object]  # a render, or another task that takes time
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,13 @@ class Study:
         self.tables[name] = {"title": title, "columns": columns, "rows": rows, "note": note, "first": first}
 
     def records(
-        self, name: str, title: str, rows: Sequence[Mapping[str, Any]], note: str = "", *, first: bool = False
+        self,
+        name: str,
+        title: str,
+        rows: Sequence[Mapping[str, object]],
+        note: str = "",
+        *,
+        first: bool = False,
     ) -> None:
         """Add a table of rows that name their values: the columns are those of the first row."""
         self.table(name, title, list(rows[0]), [list(row.values()) for row in rows], note, first=first)
@@ -172,19 +179,19 @@ def findings(part: Callable[..., None], **options: Any) -> Study:
 # ------------------------------------------------ Timing -----------------------------------------------
 
 
-def timed(run: Callable[[], Any]) -> tuple[Any, float]:
+def timed(run: Callable[[], Item]) -> tuple[Item, float]:
     """The result of a function, and its seconds."""
     start = time.perf_counter()
     result = run()
     return result, time.perf_counter() - start
 
 
-def in_turns(sides: Sequence[Callable[[int], Any]], turns: int) -> list[list[Any]]:
+def in_turns(sides: Sequence[Callable[[int], Item]], turns: int) -> list[list[Item]]:
     """The results of each side for the number of each turn, so that a load on the machine meets all.
 
     The order changes from turn to turn.
     """
-    results: list[list[Any]] = [[] for _ in sides]
+    results: list[list[Item]] = [[] for _ in sides]
     for turn in range(turns):
         both = list(zip(sides, results, strict=True))
         for side, result in both if turn % 2 == 0 else reversed(both):
@@ -199,10 +206,10 @@ def ratio_of(seconds: Sequence[float], others: Sequence[float]) -> dict[str, flo
     return {"ratio": middle, "low": low, "high": high, **medians}
 
 
-def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> dict[str, float]:
+def ratio(run: Run, other: Run, *, repeats: int) -> dict[str, float]:
     """Compare two runs in turns, see ``ratio_of``. Both run once before, which compiles their kernels."""
 
-    def seconds(side: Callable[[], Any], turn: int) -> float:
+    def seconds(side: Run, turn: int) -> float:
         return timed(side)[1]
 
     sides = [partial(seconds, side) for side in (run, other)]
@@ -210,7 +217,7 @@ def ratio(run: Callable[[], Any], other: Callable[[], Any], *, repeats: int) -> 
     return ratio_of(*in_turns(sides, repeats))
 
 
-def operations(render: Callable[..., Any]) -> list[int]:
+def operations(render: Run) -> list[int]:
     """The length of the code of each kernel of a ``mrt.render``, each counted once."""
     lengths = {}  # by the hash of the code
 
@@ -306,7 +313,7 @@ def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[st
         "passed": all(study.passed for study in studies),
         "studies": {study.name: study.summary() for study in studies},
     }
-    options: Any = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True}
+    options: Values = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True}
     pages = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"), **options)
     pages.filters["cell"] = cell
     shown = {**result, "studies": studies, "images": images, "title": title, "explain": title == VALIDATION}
@@ -330,7 +337,7 @@ def _drawn(content: Any) -> Values:
     return {"data": data, "base64": base64.b64encode(data).decode(), "kind": kind, "broad": broad}
 
 
-def cell(value: Any) -> str:
+def cell(value: object) -> str:
     """A value as people read it: floats to four digits, a dash for what is not known."""
     if value is None or value != value:
         return "–"

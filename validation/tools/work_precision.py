@@ -36,6 +36,7 @@ NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
 LEVEL = 0.95  # of all intervals
 
 Options = Mapping[str, Any]
+Given = Any  # a scene, as ``render`` takes it, or a reference
 Run = Callable[[Options, int], Result]  # a render with options and a seed
 Interval = tuple[float, float]
 
@@ -255,10 +256,10 @@ def _shown(value: float, low: float, high: float) -> str:
 
 
 def error_vs_time(
-    scene: Any,
+    scene: Given,
     cases: Mapping[str, Options],
     *,
-    reference: Any,
+    reference: Given,
     repeats: int = 5,
     shared: Options | None = None,
     errors: Sequence[float] | None = None,
@@ -316,7 +317,7 @@ def error_vs_time(
     )
 
 
-def _runner(scene: Any, shared: Options) -> Run:
+def _runner(scene: Given, shared: Options) -> Run:
     """A function that renders cases, each scene loaded once where it can be."""
     variant = runtime.use(shared.get("variant"))
     loaded = {}  # by the id of what a scene is loaded from, which the caller holds
@@ -334,7 +335,7 @@ def _runner(scene: Any, shared: Options) -> Run:
     return run
 
 
-def _reference(reference: Any, run: Run) -> tuple[Array, Array, float]:
+def _reference(reference: Given, run: Run) -> tuple[Array, Array, float]:
     """Two independent halves of the reference, or twice the same picture; and its own error."""
     if isinstance(reference, Mapping):
         spp = {"spp": int(reference["spp"]) // 2} if reference.get("spp", 1) > 1 else {}

@@ -20,6 +20,8 @@ from mrt_mitsuba.validation.oracles.reference import Array, nearest, unit
 from mrt_mitsuba.validation.studies.stability.case import Case
 from mrt_mitsuba.validation.tools.study import Values
 
+Point = tuple[float, float, float]
+
 ROUNDING = 2.0**-24
 DECADES = 10.0 ** np.arange(-6, 7, 2)
 # Beyond this ratio of distance to size, the roundings of the ray's origin are as large as the object
@@ -118,7 +120,7 @@ def solids(size: float) -> Values:
     }
 
 
-def ends(size: float) -> tuple[Any, Any]:
+def ends(size: float) -> tuple[Point, Point]:
     """The ends of an axis aslant."""
     return (0.1 * size, 0.6 * size, -0.2 * size), (-0.1 * size, -0.4 * size, 0.2 * size)
 
@@ -157,7 +159,7 @@ def placed(scene: Scene, factor: float, sizes: float) -> Scene:
     size = norm(np.subtract(camera.position, camera.target))
     way = np.array([0.48, -0.6, 0.64]) * sizes * size
 
-    def by(p: Any) -> tuple[float, float, float]:
+    def by(p: Point) -> Point:
         x, y, z = (np.array(p) * factor + way).tolist()
         return (x, y, z)
 
