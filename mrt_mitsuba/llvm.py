@@ -2,8 +2,8 @@
 
 The rule: the library that ``DRJIT_LIBLLVM_PATH`` names, else the one from the package karellen-llvm-core,
 else the newest of the system, each only from LLVM 17 on: with an older one Dr.Jit aborts the whole process at
-the first kernel with a minimum, maximum or clip in it. If there is none, the variable is set to a path that
-does not exist, so that Dr.Jit reports a missing library and never picks up an old one by itself.
+the first kernel with a minimum, maximum or clip in it. Without such a library, the variable is set to a path
+that does not exist, so that Dr.Jit reports a missing library and never picks up an old one by itself.
 
 Dr.Jit loads the library when it is first imported, so the choice is made by ``import mrt_mitsuba``. It takes
 a few milliseconds and loads nothing: versions are read from file names.
@@ -198,7 +198,7 @@ def prepare() -> Choice:
 
 
 def problem(choice: Choice) -> str | None:
-    """Return what keeps Dr.Jit from using LLVM, with the fix, or None if nothing does."""
+    """Return the obstacle to Dr.Jit's use of LLVM, with the fix, or None."""
     if choice.path is None:
         return choice.describe()
     import drjit as dr

@@ -1,4 +1,4 @@
-"""What the machine grants: memory, how much of it to use at once, and cores; by limits and control groups."""
+"""The machine's memory, the share of it to use at once, and its cores, by limits and control groups."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Budget:
     def take_texture(self, path: str, width: int, height: int, *, around: bool = False) -> None:
         """Take the memory of a picture used as a texture; ``around``: as a map of the surroundings.
 
-        Raises ``UsageError`` where there is not so much.
+        Raises ``UsageError`` where that is too much.
         """
         stays = width * height * (BYTES_PER_TEXEL_AROUND if around else BYTES_PER_TEXEL)
         needed = self.taken + stays + width * height * BYTES_PER_TEXEL_READ

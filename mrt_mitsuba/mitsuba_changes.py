@@ -1,4 +1,4 @@
-"""What this package changes in Mitsuba: ``CHANGES`` lists each change with its reason.
+"""The changes that this package makes in Mitsuba: ``CHANGES`` lists each with its reason.
 
 ``make()`` puts the changes into effect, ``undo()`` takes them back; ``mrt.register(guard=False)`` leaves
 them out. Names, signatures and pickles of what is changed stay Mitsuba's. A change is known by the function
@@ -52,7 +52,7 @@ class Turn:
         self._lock.release()
 
     def _forked(self) -> None:
-        if not getattr(self._mine, "count", 0):  # the thread that has it, if any, is not in this process
+        if not getattr(self._mine, "count", 0):  # the thread that holds it is not in this process
             self._lock = threading.RLock()
 
 

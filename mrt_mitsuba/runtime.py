@@ -27,7 +27,7 @@ _guard = True  # is Mitsuba to be changed
 def use(variant: str | None = None) -> str:
     """Make a Mitsuba variant current, with the plugins registered in it, and return its name.
 
-    Without a name, the variant that is already set stays; if there is none, it is ``llvm_ad_rgb``, or
+    Without a name, the variant that is already set stays; where none is set, it is ``llvm_ad_rgb``, or
     ``scalar_rgb`` with one warning where LLVM cannot be used.
 
     Raises ``UnknownVariantError`` for a name that this Mitsuba does not know, and ``VariantError`` for one
@@ -89,7 +89,7 @@ def default_variant() -> str:
 
 
 def obstacle(variant: str) -> str | None:
-    """Return why a known variant cannot run here, with the fix, or None if nothing speaks against it."""
+    """Return the reason that keeps a known variant from running here, with the fix, or None."""
     if variant.startswith("llvm"):
         return llvm.problem(llvm.prepare())
     if not variant.startswith("cuda"):

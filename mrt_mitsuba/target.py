@@ -58,7 +58,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Goal:
-    """How far rounds of rays go: to a target, or until their rays or seconds are spent."""
+    """The end of rounds of rays: a target, or until their rays or seconds are spent."""
 
     target: Target | None  #: None: all rays are spent
     most: int  #: rays of a pixel, on average

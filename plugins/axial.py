@@ -63,7 +63,7 @@ class AxialMesh(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
         return self._frame_of(*values) if dr.grad_enabled(values) else None
 
     def looked_at(self) -> tuple[list, list, list]:
-        """Return what a snapshot compares in place of all attributes: plain values, objects, and arrays."""
+        """Return the state that a snapshot compares instead of all attributes: values, objects, arrays."""
         arrays = [*self.parameters.values(), self.vertex_positions_buffer(), self.faces_buffer()]
         return [self.kind], [self.exact_frame, self.placement], arrays
 

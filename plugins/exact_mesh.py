@@ -15,7 +15,7 @@ class ExactMesh(mi.Mesh):
     """
 
     def quadrics(self) -> QuadricTable:
-        """Return what ``mrt_whitted`` intersects in place of the mesh."""
+        """Return the quadrics that ``mrt_whitted`` intersects in place of the mesh."""
         raise NotImplementedError
 
     def moving_frame(self) -> Frame | None:

@@ -97,7 +97,7 @@ class KernelPlan:
     reasons: tuple[tuple[str, str], ...] = ()  #: what was left out, and why, in words
 
     def reason(self, name: str) -> str | None:
-        """Return why ``name`` was left out; None where it was not."""
+        """Return the reason for leaving ``name`` out; None where it is in."""
         return dict(self.reasons).get(name)
 
 
@@ -111,7 +111,7 @@ class Tracer(Protocol):
 
 
 def bounce_cost(tracer: Tracer, int_ior: float) -> int:
-    """Return what a bounce off a material of this index takes from the bounce budget."""
+    """Return the cost of a bounce off a material of this index, a part of ``max_depth``."""
     if tracer.bounce_budget == "plain":
         return 1
     return max(10 - int(np.float32(10) * np.float32(min(int_ior, 1))), 1)
@@ -119,7 +119,7 @@ def bounce_cost(tracer: Tracer, int_ior: float) -> int:
 
 @dataclass
 class Case:
-    """What the rules go by: a scene, the integrator, and the decisions so far."""
+    """The ground for decisions: a scene, the integrator, and the decisions so far."""
 
     facts: SceneFacts
     tracer: Tracer
@@ -140,7 +140,7 @@ class Case:
         self.objects = facts.native_shapes + self.quadrics
 
     def cost(self, mirror: Mirror) -> int:
-        """Return what a bounce off a mirror takes from the bounce budget."""
+        """Return the cost of a bounce off a mirror, a part of ``max_depth``."""
         return bounce_cost(self.tracer, mirror.int_ior)
 
 

@@ -114,7 +114,7 @@ class Specular:
         return at.given[self.reflectance] * fresnel * lobe
 
     def density(self, at: Lobes, pair: Pair) -> mi.Float:
-        """Return that of the microfacet normal over 4 ωo·h."""
+        """Return the density of the microfacet normal over 4 ωo·h."""
         d = beckmann_d(pair.tan2_theta_h, at.alpha)
         if at.visible:
             return 0.25 * d * visible_over_cos(pair.wi, at.alpha)

@@ -1,4 +1,4 @@
-"""How Mitsuba makes meshes, in one place: version 3.10 changes all of it."""
+"""Making meshes with Mitsuba, in one place: version 3.10 changes all of it."""
 
 from __future__ import annotations
 

@@ -293,7 +293,7 @@ class QuadricTable:
         return np.stack([low, high], axis=1)
 
     def numbers(self, kinds: list[str]) -> np.ndarray:
-        """Return what a kernel for such kinds reads of each object, [n, 4, 4]: four numbers at a time.
+        """Return the numbers that a kernel for such kinds reads of each object, [n, 4, 4]: four at a time.
 
         A row and a coordinate of the origin, three times; kind, size of coordinates, 0, side of the normal.
         """

@@ -273,7 +273,7 @@ def _eval_bsdf(
 
 
 def _ray_arrays(scene: mi.Scene) -> list[Any]:
-    """Return what Embree's queries read of a scene; elsewhere, the scene.
+    """Return the arrays of a scene that Embree's queries read; elsewhere, the scene.
 
     To see a scene, Dr.Jit looks at all objects of all scenes, which takes 20 µs for each.
     """

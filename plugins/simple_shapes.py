@@ -103,7 +103,7 @@ class Spheres:
     def interaction(
         self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, found: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
-        """Return what ``compute_surface_interaction`` gives, and the size of the coordinates: spheres only.
+        """Return the interaction with a sphere, and the size of its coordinates, for scenes of spheres only.
 
         Derivatives and texture coordinates are left out.
         """
@@ -165,7 +165,7 @@ def is_sphere(shape: mi.Shape) -> bool:
 
 
 def center_and_radius(shape: mi.Shape) -> list[float]:
-    """Return those of a sphere, zeros for another shape."""
+    """Return centre and radius of a sphere, zeros for another shape."""
     if not is_sphere(shape):
         return [0.0] * 4
     low = [float(c) for c in shape.bbox().min]

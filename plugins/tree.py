@@ -97,7 +97,7 @@ class Tree:
         return dr.while_loop(start, goes_on, to_next_leaf, label="tree")[2]
 
     def _children(self, node: mi.UInt32, inverse: list, shift: list, rows: list) -> tuple[list, list]:
-        """Return where a ray enters and leaves the boxes of both children."""
+        """Return the distances at which a ray enters and leaves the boxes of both children."""
         near = [mi.Float(0), mi.Float(0)]
         far = [mi.Float(dr.inf), mi.Float(dr.inf)]
         for axis in range(3):

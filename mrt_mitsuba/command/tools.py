@@ -1,4 +1,4 @@
-"""What the sub-commands of ``mrt`` do that are neither renders nor checks."""
+"""The sub-commands of ``mrt`` that are neither renders nor checks."""
 
 from __future__ import annotations
 

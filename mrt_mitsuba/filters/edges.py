@@ -241,7 +241,7 @@ def save_contours(path: str | os.PathLike[str], *edges: EdgeMap) -> None:
 
 
 def _inner(grid: Grid) -> Mask:
-    """Where a pixel is not on the picture's border."""
+    """The pixels that are not on the picture's border, as a mask."""
     column, row = grid.coordinates(grid.index)
     inner_column = (column > 0) & (column < grid.width - 1)
     inner_row = (row > 0) & (row < grid.height - 1)

@@ -134,7 +134,7 @@ def check_numbers(**options: float) -> None:
 
 
 def finite(planes: Sequence[Float]) -> Mask:
-    """Where all of several planes have finite numbers."""
+    """The pixels at which all of several planes are finite, as a mask."""
     return functools.reduce(operator.and_, map(dr.isfinite, planes))
 
 
@@ -158,13 +158,13 @@ def window_means(values: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _window_sizes(count: int, reach: int) -> np.ndarray:
-    """How many of a line's pixels are within reach of each, itself among them."""
+    """The number of a line's pixels within reach of each, itself among them."""
     before = np.minimum(np.arange(count), reach)
     return before + before[::-1] + 1
 
 
 def dilated(mask: np.ndarray, reach: int) -> np.ndarray:
-    """Where a mask is true within so many pixels along both axes."""
+    """A mask grown by so many pixels along both axes."""
     for count in mask.shape[:-3:-1]:  # along rows, then, turned, along columns
         wide = np.pad(mask, [(0, 0)] * (mask.ndim - 1) + [(reach, reach)])
         near = (wide[..., step : step + count] for step in range(2 * reach + 1))

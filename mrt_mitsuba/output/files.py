@@ -245,7 +245,7 @@ def png(image: Image) -> bytes:
 
 
 def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """The picture in 8 bit as ``to_8bit`` has it, some rows at a time with the number of the first."""
+    """The picture in 8 bit as ``to_8bit`` gives it, some rows at a time with the number of the first."""
     import numpy as np
 
     if tonemap not in TONEMAPS:

@@ -1,4 +1,4 @@
-"""Where and when rays start, by a lattice or a film's rules, and how a film turns values into a picture."""
+"""Places and times at which rays start, on a lattice or by a film's rules, and the film's own filter."""
 
 from __future__ import annotations
 
@@ -97,12 +97,12 @@ class Places:
 
     @property
     def holds_centre(self) -> bool:
-        """Return whether the pixel's centre is one of the lattice's samples; it then comes first."""
+        """Is the pixel's centre one of the lattice's samples? It then comes first."""
         return self.lattice == "report" or (self.lattice == "centered" and self.aa % 2 == 1)
 
     def at(self, pixel: mi.UInt32, ray: mi.UInt32, width: int, height: int) -> tuple[mi.Point2f, mi.Float]:
-        """Return where and when a ray of a pixel starts: its place in a picture of this size, [0, 1]², x to
-        the right and y down, and its time."""
+        """Return the start of a ray of a pixel: its place in a picture of this size, [0, 1]², x to the right
+        and y down, and its time."""
         row, column = divide(pixel, width)
         sample = divide(ray, self.repeats)[0] + opaque(self.first)
         if self.lattice == "centered" and self.holds_centre:
@@ -165,7 +165,7 @@ class Film:
         self.rfilter = rfilter.class_name()
 
     def picture(self, sampled: np.ndarray) -> np.ndarray:
-        """Return what lies in the picture, of an array [..., rows, columns, channels]."""
+        """Return the picture in an array [..., rows, columns, channels], without the border."""
         rows, columns = (slice(self.border, n - self.border) for n in self.shape)
         return sampled[..., rows, columns, :]
 

@@ -52,7 +52,7 @@ class Pass:
 
     @property
     def repeated(self) -> str:
-        """How often each sample is traced, in words; empty for once."""
+        """The number of rays of each sample, in words; empty for one."""
         return f", {self.places.repeats} rays each" if self.places.repeats > 1 else ""
 
 
@@ -143,7 +143,7 @@ def _with(layers: frozenset[str]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What was known before a render, and everything that was decided from it. ``str()`` describes it."""
+    """The facts known before a render, and every decision made from them. ``str()`` describes it."""
 
     scene: str  #: its number or name
     variant: str  #: of Mitsuba
@@ -203,7 +203,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class _Choices:
-    """What the options leave open, decided for one scene.
+    """Decisions that the options leave open, made for one scene.
 
     Someone's own scene is rendered as Mitsuba renders it, the report's scenes as the report does.
     """
@@ -469,7 +469,7 @@ def _centre(choices: _Choices) -> Places:
 def _left_out(
     traced: frozenset[str], passes: set[str], source: Source, shader: Shader, choices: _Choices
 ) -> Iterator[tuple[str, str]]:
-    """What kernels and passes leave out, each with its reason."""
+    """The parts that kernels and passes leave out, each with its reason."""
     for name, why in shader.kernel.reasons if shader.kernel else ():
         yield kernel_plan.WHAT.get(name, name), why
     if Edges.name not in passes:
@@ -490,7 +490,7 @@ def _left_out(
 
 
 def _ignored(source: Source, film: Film, choices: _Choices) -> Iterator[tuple[str, str]]:
-    """What the film and its sampler ask for in vain, each with its reason."""
+    """The wishes of the film and its sampler that are not followed, each with its reason."""
     if choices.lattice != FILM:
         if source.own:
             yield (

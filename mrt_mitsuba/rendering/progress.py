@@ -115,7 +115,7 @@ class NotebookProgress(TerminalProgress):
 
 
 def default_progress() -> Progress:
-    """What shows the progress of a render where the caller does not say: nothing, but in notebooks."""
+    """The progress of a render where the caller gives none: bars in notebooks, else nothing."""
     return NotebookProgress() if "ipykernel" in sys.modules else Progress()
 
 
@@ -162,8 +162,8 @@ class Job:
 
     @property
     def on_round(self) -> Callable[[RoundPicture], object] | None:
-        """What is called with the picture after each round of rays, and stops the render by returning False;
-        None where nobody looks."""
+        """The function to call with the picture after each round of rays, which stops the render by returning
+        False; None without one."""
         if not self.progress.shows_rounds:
             return self._on_round
 
@@ -174,7 +174,7 @@ class Job:
         return show
 
     def timings(self) -> Timings:
-        """What the render has taken up to now."""
+        """The seconds of the render up to now."""
         return Timings(
             total=time.perf_counter() - self._began,
             load=self._loaded - self._began,

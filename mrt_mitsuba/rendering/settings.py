@@ -181,7 +181,7 @@ class RenderSettings:
         return self.target if isinstance(self.target, Target) else None
 
     def goal(self, stated: Goal | None = None) -> Goal | None:
-        """How far rounds of rays go; None for a render without rounds.
+        """The goal of rounds of rays; None for a render without rounds.
 
         ``stated``: what the scene's integrator says, for where no option says how many rays a pixel gets.
         Raises ``UsageError`` for too few rays.
@@ -200,7 +200,7 @@ class RenderSettings:
         return Goal(stated.target, self.maxspp or stated.most, seconds)
 
     def model(self) -> dict[str, Any]:
-        """What is given about a model and its view, as ``obj.obj_scene`` takes it.
+        """The options given about a model and its view, as ``obj.obj_scene`` takes them.
 
         Raises ``UsageError`` for a view that shows nothing.
         """

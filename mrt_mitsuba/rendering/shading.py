@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 class RayValues:
     """Values along camera rays, for the rows of the table of layers; what no row reads costs nothing.
 
-    ``valid``: did the integrator find anything, Mitsuba's alpha; ``aovs``: channels of the integrator's own;
-    ``trace``: what an integrator with a ``kernel_plan`` found, None of any other, where Mitsuba finds the
+    ``valid``: did the integrator find anything, Mitsuba's alpha; ``aovs``: the integrator's own channels;
+    ``trace``: the result of an integrator with a ``kernel_plan``; None for any other, where Mitsuba finds the
     first hit.
     """
 
@@ -157,7 +157,7 @@ class Shader:
         self.aovs = tuple(integrator.aov_names())  #: names of the integrator's own channels
 
     def shift(self, time: mi.Float) -> mi.Vector3f:
-        """Return how far the camera has moved."""
+        """Return the shift of the camera at a time."""
         if self.motion is None:
             return mi.Vector3f(0)
         if mi.variant().startswith("scalar"):
@@ -165,7 +165,7 @@ class Shader:
         return dr.opaque(mi.Vector3f, self.motion) * time
 
     def values(self, place: mi.Point2f, time: mi.Float | None, sampler: mi.Sampler) -> RayValues:
-        """Return what is known along the rays through places in the picture, [0, 1]².
+        """Return the values along rays through places in the picture, [0, 1]².
 
         ``time``: from 0, when the shutter opens, to 1; None: the sampler draws it, as for Mitsuba's sensors.
         Draws what Mitsuba's integrators draw, in their order.

@@ -45,7 +45,7 @@ class Camera:
     hfov: float = 60.0
 
     def problem(self) -> str:
-        """Why it can see nothing; an empty text if it can."""
+        """The reason that it sees nothing; an empty text if it sees."""
         import numpy as np
 
         for name in ("position", "target", "up"):

@@ -97,7 +97,7 @@ def read_obj(
 
 
 class _Reader:
-    """What has been read of a file."""
+    """A file, as far as it has been read."""
 
     def __init__(self, path: Path, convention: str) -> None:
         self.path = path

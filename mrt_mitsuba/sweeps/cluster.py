@@ -120,7 +120,7 @@ def gpus() -> list[str]:
 
 
 def inspect(client: Client, scratch: str, here: str) -> dict[str, int]:
-    """How many workers share each set of cores, see ``render_job``.
+    """The number of workers that share each set of cores, see ``render_job``.
 
     Raises ``ClusterError`` or ``OutputError`` where one has other versions than those ``here`` or cannot be
     used.

@@ -84,7 +84,7 @@ def _locked(folder: str) -> Iterator[bool]:
 
 
 def _clear(folder: str) -> dict[str, Facts]:
-    """Remove the folders of killed sweeps; returns what they noted, as ``reserved`` has it."""
+    """Remove the folders of killed sweeps; returns their notes as ``reserved`` does."""
     facts: dict[str, Facts] = {}
     for left in Path(folder).iterdir():
         if not re.fullmatch(re.escape(_SCRATCH) + "[a-z0-9_]{8}", left.name) or left.is_symlink():

@@ -25,8 +25,8 @@ from mrt_mitsuba.sweeps.pictures import MADE_WITH, checksum
 
 
 def describe(folder: str) -> Facts:
-    """What a client asks each worker before it begins: the versions of all that decides about pixels, a name
-    for its cores, the same for workers that share them, and whether it sees a folder."""
+    """Facts that a client asks each worker for before it begins: the versions of all that decides about
+    pixels, a name for its cores, the same for workers that share them, and whether it sees a folder."""
     versions = {**runtime.versions(), "python": f"{sys.version_info[0]}.{sys.version_info[1]}"}
     return {
         "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
@@ -46,7 +46,7 @@ def outcome(job: Job, scratch: str) -> Facts:
 def render_job(
     job: Job, folder: str, scratch: str, png: bool, versions: str, sharing: Mapping[str, int]
 ) -> None:
-    """Render a picture, write it to ``folder``, and note its facts for the table, or why there is none.
+    """Render a picture, write it to ``folder``, and note its facts for the table, or its error.
 
     ``scratch``: holds the files until they are complete, and the notes; ``versions``: those that all workers
     must have; ``sharing``: how many workers share cores, by their name.
