@@ -142,7 +142,7 @@ def _delta_either_way(law: Law, case: Case) -> None:
 
     def followed(i: Array, _: Array, t: Array, u: Array) -> Array:
         s = case.sample(i, u, t)
-        return s.weight * (s.pdf * s.eta.astype(np.float64) ** 2)[:, None]
+        return s.weight * (s.pdf * np.float64(s.eta) ** 2)[:, None]
 
     there = wi, wo, uv, u
     and_back = wo, wi, uv, v
@@ -202,7 +202,7 @@ def _extremes(case: Case) -> Lanes:
     u = np.where(extreme, rng.choice(UNIFORM, (count, 3)), case.uniform(count, 3))
     corner = rng.random((count, 2)) < 0.3
     uv = np.where(corner, rng.integers(0, 2, (count, 2)), rng.random((count, 2)))
-    return Lanes(wi=wi, wo=wo, u=u.astype(np.float32), uv=uv.astype(np.float32))
+    return Lanes(wi=wi, wo=wo, u=np.float32(u), uv=np.float32(uv))
 
 
 def _ends(key: str, number: float) -> tuple[float, float]:
@@ -218,7 +218,7 @@ def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None =
     value, pdf = case.both(at.wi, at.wo, at.uv)
     value_of_pair, pdf_of_pair = case.pair(at.wi, at.wo, at.uv)
     s = case.sample(at.wi, at.u, at.uv)
-    length = np.linalg.norm(s.wo.astype(np.float64), axis=1)
+    length = np.linalg.norm(np.float64(s.wo), axis=1)
     values = {
         "eval()": _bad(value),
         "pdf()": _bad(pdf),

@@ -210,7 +210,7 @@ def sampling(law: Law, case: Case) -> None:
     s = case.samples
     if not s.lit.any():
         raise Skip("no sample carries light")
-    points = case.points.astype(np.float64)
+    points = np.float64(case.points)
     scale = abs(s.dist) + abs(points).max(axis=1)
     off = norm(s.p - points - s.dist[:, None] * s.d, axis=1)
     law.hold("place", np.nan_to_num((off / scale)[s.lit]))
@@ -310,7 +310,7 @@ def finite(law: Law, case: Case) -> None:
     """All numbers of samples are finite, directions one unit long, weights and densities not negative."""
     s = case.samples
     sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
-    length = abs(norm(s.d.astype(np.float64), axis=1) - 1)
+    length = abs(norm(np.float64(s.d), axis=1) - 1)
     usable = (length <= LENGTH) & np.isfinite(s.dist) & (s.pdf >= 0)
     law.hold("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable))
     if not probe.is_scalar():

@@ -454,7 +454,7 @@ def _made(value: Given) -> Given:
 def _written(value: object) -> str:
     """A value as Python text; float32 in the fewest digits that give it back."""
     if isinstance(value, np.ndarray):
-        inner = ", ".join(str(x) for x in value.astype(np.float32))
+        inner = ", ".join(str(x) for x in np.float32(value))
         vector = value.dtype == np.float32 and len(value) in (2, 3)
         return inner if vector else f"[{inner}]"
     if isinstance(value, np.generic):

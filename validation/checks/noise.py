@@ -35,7 +35,7 @@ def ecnoise(lines: Array, *, coarse: bool = False) -> Array:
     the values change along it by more than ``STEEP`` of the largest; and NaN wherever they change by half.
     ``coarse``: the least of all orders from the third, and 0 where values change by half.
     """
-    table = lines.astype(np.float64)
+    table = np.float64(lines)
     gamma = 1.0
     levels = []
     signs = []
@@ -85,7 +85,7 @@ def measure(
     high at any step that is large compared with them, unlike kinks and what is left of a smooth function:
     only noise that is ``ALIKE`` at two steps counts.
     """
-    inputs = inputs.astype(np.float32)
+    inputs = np.float32(inputs)
     rng = np.random.default_rng(seed)
 
     def values(steps: Array, valid: Callable[[Array], Array] = lambda x: x) -> Array:

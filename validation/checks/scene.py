@@ -96,29 +96,24 @@ def check_scene(
     kinds = _plugins(source.scene)
     checks = {}
     left_out = []
-    chosen = [(kind, i) for kind, alike in kinds.items() for i in _spread_over(len(alike))]
-    with (progress or Progress()).stage("Laws", len(chosen)) as advance:
-        for kind, number in chosen:
-            plugin = kinds[kind][number]
-            name = f"{kind} {plugin.id() or number}"
-            if name in checks:
-                name = f"{name} ({number})"
-            check = _check(kind.split()[0], plugin, source.scene, quick, seed)
-            checks[name] = replace(check, subject=name)
-            advance(1)
-    for kind, alike in kinds.items():
-        more = len(alike) - len(_spread_over(len(alike)))
-        if more:
-            left_out.append(f"{more} more of {kind} are like those that were checked")
+    chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}
+    with (progress or Progress()).stage("Laws", sum(map(len, chosen.values()))) as advance:
+        for kind, alike in kinds.items():
+            for number in chosen[kind]:
+                plugin = alike[number]
+                name = f"{kind} {plugin.id() or number}"
+                if name in checks:
+                    name = f"{name} ({number})"
+                check = _check(kind.split()[0], plugin, source.scene, quick, seed)
+                checks[name] = replace(check, subject=name)
+                advance(1)
+            more = len(alike) - len(chosen[kind])
+            if more:
+                left_out.append(f"{more} more of {kind} are like those that were checked")
     instances = sum(shape.class_name() == "Instance" for shape in source.scene.shapes())
     if instances:
         left_out.append(f"{instances} instances are not checked: give a dict of one with its group")
     return SceneCheck(source.name, checks, _hunt(source, quick, seed), tuple(left_out))
-
-
-def _spread_over(count: int) -> range:
-    """Indices of the plugins that are checked, of many of one kind."""
-    return range(0, count, max(count // ALIKE, 1))
 
 
 def _check(word: str, plugin: mi.Object, scene: mi.Scene, quick: bool, seed: int) -> Check:

@@ -134,7 +134,7 @@ def surface(law: Law, case: Case) -> None:
     """p = o + t d is on the surface; spawned rays do not meet it where they start; digits are kept."""
     met = case.met
     numbers = abs(np.concatenate([met.o, met.p], axis=1))
-    along = met.o.astype(np.float64) + met.t[:, None] * met.d
+    along = np.float64(met.o) + met.t[:, None] * met.d
     off = abs(along - met.p).max(axis=1)
     law.hold("on_ray", off / (ROUNDING * (numbers.max(axis=1) + met.t)), met)
     _from_near_by(law, case)
@@ -193,11 +193,11 @@ def _from_near_by(law: Law, case: Case) -> None:
     again = trace(case.target, np.float32(met.p - reach * d), d)
     same = again.met & near(met.p, again.p)
     largest = abs(met.p).max(axis=1) + reach
-    along = again.o + again.t[:, None].astype(np.float64) * d
+    along = again.o + np.float64(again.t[:, None]) * d
     off = abs(along - again.p).max(axis=1)
     # the same line the other way around, from as far behind
     back = trace(case.target, np.float32(met.p + reach * d), -d)
-    apart = norm(back.p.astype(np.float64) - again.p, axis=1) * abs(dot(met.n, d))
+    apart = norm(np.float64(back.p) - again.p, axis=1) * abs(dot(met.n, d))
     alike = same & back.met & (back.part == met.part) & (apart < 0.01 * case.size)
     alike &= case.behind.met.mean() > 0.5  # else rays pass it from behind
     for name, error, known in (("near_by", off, same), ("behind", apart, alike)):
@@ -416,14 +416,14 @@ def far(law: Law, case: Case) -> None:
     """Hits from ten thousand sizes away are those of the same lines from nearby, to some roundings."""
     met = case.met.only(slice(0, case.count(2**12, 2**15)))
     distance = FAR * case.size
-    goal = met.p.astype(np.float64)
+    goal = np.float64(met.p)
     d = met.d
-    exactly = d.astype(np.float64)
+    exactly = np.float64(d)
     there = trace(case.target, np.float32(goal - distance * exactly), d)
     closer = np.float32(there.o + (FAR - 1.5) * case.size * exactly)
     here = trace(case.target, closer, d)
     cos = abs(here.cos)
-    apart = norm(there.p.astype(np.float64) - here.p, axis=1)
+    apart = norm(np.float64(there.p) - here.p, axis=1)
     error = apart * cos / (ROUNDING * distance)
     bad = here.met & (cos > 4 * FLAT) & (~there.met | (error > HIT_ROUNDINGS))
     # a rounded origin moves the line: only what all lines around it meet counts

@@ -126,7 +126,12 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     across = unit(np.cross(d, case.units(count)))
     disk = radius * np.sqrt(case.rng.random((count, 1))) * across
     start = np.float32(case.middle + disk - 2 * radius * d)
-    twice = _coinciding(case, Lanes(p=p, n=unit(n)))
+    # where two parts of the surface coincide, a line meets only one of them
+    at = Lanes(p=p, n=unit(n))
+    one = trace(case.target, leave(at, at.n), -at.n)
+    other = trace(case.target, leave(at, -at.n), at.n)
+    both = one.met & other.met & (one.part != other.part)
+    twice = (both & near(p, one.p) & near(p, other.p)).mean()
     crossed = np.zeros(count)
     points = []
     for line, hits in walk(case.target, trace(case.target, start, d)):
@@ -160,14 +165,6 @@ AXES = 12  # aslant, along which positions are compared
 CUTS = (0.0, np.pi / 2)  # where azimuths start and end: crowding there shows less
 ROOM = 2e-3  # lines that graze are left room for
 VIEWS = 3  # from which directions are compared
-
-
-def _coinciding(case: Case, at: Lanes) -> float:
-    """Share of points where two parts of the surface coincide, and a line meets only one of them."""
-    one = trace(case.target, leave(at, at.n), -at.n)
-    other = trace(case.target, leave(at, -at.n), at.n)
-    both = one.met & other.met & (one.part != other.part)
-    return (both & near(at.p, one.p) & near(at.p, other.p)).mean()
 
 
 def _angle(v: Array, axis: Array, cut: float) -> Array:

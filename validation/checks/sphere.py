@@ -26,7 +26,7 @@ _SPREAD = np.sum([(np.arange(2**DEPTH) >> k & 1) << 2 * k for k in range(DEPTH)]
 
 def encode(wo: Array) -> Array:
     """Morton codes [N] of directions [N, 3]."""
-    x, y, z = wo.T.astype(np.float64)
+    x, y, z = np.float64(wo.T)
     r = np.sqrt((x * x + y * y) / (1 + abs(z)))
     turn = np.arctan2(y, x) / (2 * np.pi) + 0.5
     return (z < 0) * HEMISPHERE + (_bits(r) | (_bits(turn) << 1))

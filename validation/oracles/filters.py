@@ -43,7 +43,7 @@ def sobel_edges(image: Array) -> Edges:
 
 def blur_amount(depth: Array, focal_distance: float, focal_range: float) -> Array:
     """The height map: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``, and 8 for a miss."""
-    amount = np.clip(abs(focal_distance - depth.astype(np.float64)) - focal_range, 0, 8)
+    amount = np.clip(abs(focal_distance - np.float64(depth)) - focal_range, 0, 8)
     return np.where((depth <= 0) | np.isinf(depth), 8, amount)
 
 

@@ -137,17 +137,20 @@ def _left_out(result: Result) -> str:
 
 def savings(name: str, found: Mapping[int, Figures]) -> Figure:
     """Draw how many times as much of a measure scenes cost where nothing is left out, a bar for each."""
+    from matplotlib.ticker import EngFormatter
+
     planned = np.array([figures[PLANNED][name] for figures in found.values()])
     times = np.array([figures[MEASURES[name]][name] for figures in found.values()]) / planned
     most = max(times.max(), 1.2)
     rows = np.arange(len(found))
+    quantity = EngFormatter("s" if name == "seconds" else "")
     drawn, axes = diagrams.panel(TITLES[name], 4.6, 0.3 * len(found) + 1)
     axes.barh(rows, times, height=0.7, color="#f2b98f")
     axes.barh(rows, np.ones(len(rows)), height=0.7, color=diagrams.COLORS[0])
     shown: Values = {"va": "center", "fontsize": diagrams.LABELS}
     for row, (own, factor) in enumerate(zip(planned, times, strict=True)):
         axes.text(max(factor, 1) + 0.02 * most, row, f"× {factor:.2f}", color=diagrams.TEXT, **shown)
-        axes.text(0.02 * most, row, _quantity(own, name), color="white", **shown)
+        axes.text(0.02 * most, row, quantity(float(f"{own:.3g}")), color="white", **shown)
     axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, 1.25 * most))
     axes.set_yticks(rows, [f"scene {number}" for number in found])
     axes.tick_params(axis="y", length=0)
@@ -155,11 +158,3 @@ def savings(name: str, found: Mapping[int, Figures]) -> Figure:
     axes.spines["left"].set_visible(False)
     axes.axvline(1, color=diagrams.TEXT, linewidth=0.6)
     return drawn
-
-
-def _quantity(value: float, name: str) -> str:
-    if name == "seconds":
-        return f"{1000 * value:.0f} ms"
-    if value >= 1e6:
-        return f"{value / 1e6:.2g} M"
-    return f"{value / 1e3:.3g} k" if value >= 1e4 else f"{value:.0f}"

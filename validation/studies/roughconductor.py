@@ -175,7 +175,7 @@ def compare_roughconductor(
     timings = {"ours": seconds[0], "theirs": seconds[1], "ratio": seconds[0] / seconds[1]}
     images = {"ours": first, "theirs": second, "difference": first - second}
     return RoughconductorComparison(
-        alpha, errors, timings, {n: i.astype(np.float32) for n, i in images.items()}, spp * renders
+        alpha, errors, timings, {n: np.float32(i) for n, i in images.items()}, spp * renders
     )
 
 

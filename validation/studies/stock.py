@@ -82,7 +82,7 @@ def gloss(study: Study, *, quick: bool) -> None:
         black: Nodes = {"alpha": alpha, "ior": 3.0, "diffuse": (0, 0, 0), "specular": (1, 1, 1)}
         scene = with_materials(report_scene(0), partial(replace, **black))
         nodes = replace(scene, planes=(), lights=()).to_dict(width=width, height=height, fresnel="dielectric")
-        return nodes | {"sky": {"type": "envmap", "bitmap": mi.Bitmap(waves.astype(np.float32))}}
+        return nodes | {"sky": {"type": "envmap", "bitmap": mi.Bitmap(np.float32(waves))}}
 
     whitted = {"type": "mrt_whitted", "min_contribution": 0.0}
     mirror = mrt.render(spheres(1.0), **AT_CENTRES, layers=["depth"], integrator=whitted)

@@ -60,7 +60,7 @@ def albedo(bsdf: Any, wi: Array, *, resolution: int = 700) -> Array:
     value, _ = evaluate(bsdf, wi, direction(middles[:, None], phi).reshape(-1, 3))
     # dω = d cos dφ, dφ = 2π |s| ds, ds = 2 dv
     weight = np.broadcast_to(4 * np.pi * abs(s), (resolution, resolution)).ravel() / resolution**2
-    return (value.astype(np.float64) * weight[:, None]).sum(axis=0)
+    return (np.float64(value) * weight[:, None]).sum(axis=0)
 
 
 def relative_error(found: Array, expected: Array) -> Array:

@@ -89,7 +89,7 @@ class Difference:
         size = abs(values).max(axis=2)
         scale = np.max(size, initial=0, where=np.isfinite(size)) or 1
         colors = colormaps["inferno"](np.minimum(size / scale, 1))
-        write_png(f"{stem}.png", colors[..., :3].astype(np.float32))
+        write_png(f"{stem}.png", np.float32(colors[..., :3]))
 
     def __str__(self) -> str:
         lines = [f"{name:<8} {'-' if v is None else f'{v:.4g}'}" for name, v in self.measures().items()]
@@ -134,7 +134,7 @@ def compare(a: Picture, b: Picture, layer: str = "", *, peak: float = 1.0) -> Di
         largest=float(size.max()),
         place=divmod(int(size.max(axis=2).argmax()), size.shape[1]),
         p_value=_p_value(sides),
-        difference=difference.astype(np.float32),
+        difference=np.float32(difference),
         pictures=(first, second),
         inputs=tuple(os.fspath(side) for side in (a, b) if isinstance(side, str | os.PathLike)),
     )

@@ -51,7 +51,7 @@ def read_original(path: str | os.PathLike[str]) -> Original:
 def shortened(picture: np.ndarray, window: tuple[int, int, int, int], block: int, bits: int) -> np.ndarray:
     """A window of a picture, the means of its blocks, with so many significant bits."""
     x, y, width, height = window
-    part = picture[y : y + height, x : x + width].astype(np.float64)
+    part = np.float64(picture[y : y + height, x : x + width])
     part = part.reshape(height // block, block, width // block, block, -1).mean(axis=(1, 3))
     digits, exponent = np.frexp(part)
     return np.ldexp(np.round(digits * 2.0**bits), exponent - bits).astype(np.float32)

@@ -327,7 +327,7 @@ def _drawn(content: Any) -> Values:
     if isinstance(content, np.ndarray):
         kind = "picture"
         broad = content.shape[1] > 2 * len(content)
-        PIL.Image.fromarray(to_8bit(content.astype(np.float32), "srgb")).save(buffer, format="PNG")
+        PIL.Image.fromarray(to_8bit(np.float32(content), "srgb")).save(buffer, format="PNG")
     else:
         # inches
         kind = "plot"

@@ -272,7 +272,7 @@ def floor(far: float, count: int) -> Curves:
     """Measure where rays meet a floor, so many heights of the eye away."""
     rng = np.random.default_rng(6)
     normal = np.array([0.6, 0.64, 0.48])
-    up = unit(normal.astype(np.float32).astype(np.float64))
+    up = unit(np.float32(normal).astype(np.float64))
     o, d = _aimed(far * unit(np.cross(rng.normal(size=(count, 3)), up)), np.tile(up, (count, 1)))
     first = -(o @ np.float32(up)) / (d @ np.float32(up))
     turned = mi.ScalarTransform4f().look_at([0, 0, 0], up.tolist(), [0, 0, 1]).scale(2 * far)

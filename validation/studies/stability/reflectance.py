@@ -164,7 +164,7 @@ def lobes_with_truth(count: int) -> Arrays:
     m = unit(np.stack([tan * np.cos(psi), tan * np.sin(psi), np.ones(pairs[1])], axis=1))
     wo = np.float32(2 * (wi * m).sum(axis=1, keepdims=True) * m - wi)
     wi = np.float32(wi)
-    x, y, z = (wi.astype(np.float64) + wo).T  # along the half vector
+    x, y, z = (np.float64(wi) + wo).T  # along the half vector
     steepness = (x**2 + y**2) / (z * alpha) ** 2
     keep = (wo[:, 2] > 5e-8) & (steepness < STEEPEST)
     lobes = {"wi": wi, "wo": wo, "alpha": alpha, "ior": rng.choice(IORS, pairs[1]), "steepness": steepness}
