@@ -65,7 +65,7 @@ def start(turns: int) -> Row:
     silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600, "env": environment}
 
     def seconds(command: Sequence[str], turn: int) -> float:
-        return timed(lambda: subprocess.run([sys.executable, *command], **silent))[1]
+        return timed(partial(subprocess.run, [sys.executable, *command], **silent))[1]
 
     with tempfile.TemporaryDirectory() as folder:
         commands = ("-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1"), ("-c", BARE)

@@ -19,7 +19,7 @@ from mrt_mitsuba.rendering.progress import TerminalProgress
 
 # By name: the module, imported when it is run; what --list says of it; seconds of a quick and of a full run
 # on two idle cores, about
-STUDIES: dict[str, tuple[str, str, int, int]] = {
+STUDIES = {
     "laws": ("bsdf_laws", "does the material obey its own laws", 6, 60),
     "roughconductor": ("roughconductor", "is the material the function that Mitsuba's is", 10, 90),
     "stock": ("stock", "are light, gloss and mirrors what Mitsuba computes", 15, 60),

@@ -92,8 +92,9 @@ def corrected_dof(image: Array, radius: Array) -> Array:
         order = there[..., 4] - radius
         own_disc = disc(abs(radius), dx, dy)
         their_disc = disc(theirs, dx, dy)
-        parts = np.minimum(-order, 1), 1 - abs(order), np.minimum(order, 1)
-        nearer, level, farther = (np.maximum(part, 0)[..., None] for part in parts)
+        nearer = np.clip(-order, 0, 1)[..., None]
+        level = np.maximum(1 - abs(order), 0)[..., None]
+        farther = np.clip(order, 0, 1)[..., None]
         wider_behind = ((order > 0) & (theirs > abs(radius)))[..., None]
         front += nearer * their_disc * light
         same += level * np.where(wider_behind, own_disc, their_disc) * light

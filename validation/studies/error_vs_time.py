@@ -203,7 +203,8 @@ def sampling(number: int, cost: Cost) -> Trade:
     """Which pixels get how many samples, and where in the pixel."""
     least = cost.amounts[0]
     greatest = cost.amounts[-1]
-    few, many = (f"none aa={aa} centered" for aa in (least, greatest))
+    few = f"none aa={least} centered"
+    many = f"none aa={greatest} centered"
     edges = f"sobel aa={greatest} centered"
     why = "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1"
     cases = {
@@ -241,7 +242,8 @@ def whitted(number: int, cost: Cost) -> Trade:
     cases = {f"min_contribution={255 * c:g}/255": integrator(min_contribution=c) for c in CUT_OFFS}
     default = list(cases)[1]
     cases |= {f"max_depth={depth}": integrator(max_depth=depth) for depth in DEPTHS}
-    first, last = (f"max_depth={depth}" for depth in (DEPTHS[0], DEPTHS[-1]))
+    first = f"max_depth={DEPTHS[0]}"
+    last = f"max_depth={DEPTHS[-1]}"
 
     def limits(found: Findings) -> list[Limit]:
         largest = found.points[default].difference.largest
@@ -278,7 +280,8 @@ def path(number: Number, cost: Cost) -> Trade:
         cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
 
     def limits(found: Findings) -> list[Limit]:
-        few, many = (f"path spp={spp}" for spp in (cost.counts[0], cost.counts[-1]))
+        few = f"path spp={cost.counts[0]}"
+        many = f"path spp={cost.counts[-1]}"
         gain = (cost.counts[-1] / cost.counts[0]) ** 0.5
         off = abs(rmse(found, many) / rmse(found, few) * gain - 1)
         why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"

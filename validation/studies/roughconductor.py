@@ -7,6 +7,7 @@ import os
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import mitsuba as mi
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.special import erfc
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output.files import write_exr
-from mrt_mitsuba.validation.checks.probe import is_scalar
+from mrt_mitsuba.validation.checks.probe import Array, is_scalar
 from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, lobe_pairs, relative_error
 from mrt_mitsuba.validation.tools.compare import compare, p_values
 from mrt_mitsuba.validation.tools.scenery import ball_scene
@@ -61,10 +62,13 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> dict[str, f
     the rounding of the length of ωo, by 6e-8 / |ωi + ωo|².
     """
     wi, wo = lobe_pairs(count, alpha, seed=seed)
-    visible, plain = (
-        [evaluate(mi.load_dict(bsdf(alpha, visible=way)), wi, wo) for bsdf in (ours, theirs)]
-        for way in (True, False)
-    )
+
+    def both(visible: bool) -> list[list[Array]]:
+        bsdfs = [mi.load_dict(of(alpha, visible=visible)) for of in (ours, theirs)]
+        return [evaluate(bsdf, wi, wo) for bsdf in bsdfs]
+
+    visible = both(True)
+    plain = both(False)
     value = np.max([relative_error(one[0], other[0]) for one, other in (visible, plain)])
     # In the density of visible normals, roughconductor takes the rational fit of G₁(ωi) for the normaliser
     # 1 / (1 + Λ(ωi)), and is off by up to 0.4 %: bring it to integrate to one
@@ -153,14 +157,15 @@ def compare_roughconductor(
     runtime.use(runtime.FAST)
     scenes = [ball_scene(bsdf(alpha, visible=sample_visible), size=size) for bsdf in (ours, theirs)]
 
-    def render(turn: int, index: int) -> NDArray[np.float32]:
+    def render(index: int, turn: int) -> NDArray[np.float32]:
         return np.array(mi.render(scenes[index], spp=spp, seed=seed + 1 + index + 2 * turn))
 
-    sides = [lambda turn, i=i: timed(lambda: render(turn, i)) for i in range(2)]
+    sides = [partial(timed, partial(render, i)) for i in range(2)]
     in_turns(sides, 1)  # compiles
-    found = [zip(*runs, strict=True) for runs in in_turns(sides, renders)]
-    pictures, times = zip(*found, strict=True)
-    (first, second), seconds = np.mean(pictures, axis=1), [statistics.median(side) for side in times]
+    runs = in_turns(sides, renders)
+    pictures = [[picture for picture, _ in side] for side in runs]
+    seconds = [statistics.median(time for _, time in side) for side in runs]
+    first, second = np.mean(pictures, axis=1)
     # Drawn from D, whose density is the same in both. A path that rounding sends past the other side of an
     # edge goes on differently; anything else would show in most pixels of the ball
     plain = (ball_scene(bsdf(alpha, visible=False), size=size) for bsdf in (ours, theirs))

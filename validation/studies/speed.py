@@ -97,7 +97,11 @@ def _render(nodes: Nodes, **options: Any) -> Run:
 def _by_mitsuba(nodes: Nodes, integrator: Nodes | None, spp: int) -> Run:
     scene = load(nodes)
     chosen = mi.load_dict(integrator) if integrator else scene.integrator()
-    return lambda: np.array(mi.render(scene, integrator=chosen, spp=spp))
+
+    def render() -> np.ndarray:
+        return np.array(mi.render(scene, integrator=chosen, spp=spp))
+
+    return render
 
 
 def against_mitsuba(extent: Extent) -> Iterator[Pair]:
@@ -112,12 +116,13 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
         return mrt.scene_dict(number, width=extent.width, height=extent.height, **options)
 
     def other_light(ours: Run, other: Run, factor: float = 1) -> float:
-        one, two = (float(np.mean(side(), dtype=np.float64)) for side in (ours, other))
-        return abs(two / one / factor - 1)
+        brightness = np.mean(ours(), dtype=np.float64)
+        return abs(np.mean(other(), dtype=np.float64) / brightness / factor - 1)
 
     def direct(number: int, flavor: str) -> tuple[Run, Run]:
         """Direct light in the scene of a flavour, with Mitsuba's lights in place of ours."""
-        stock, own = (nodes(number, flavor=name) for name in ("stock", flavor))
+        stock = nodes(number, flavor="stock")
+        own = nodes(number, flavor=flavor)
         lights = {name: node for name, node in stock.items() if name.startswith("light_")}
         del own["sky"]  # direct would sample it, mrt_whitted does not
         ours = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
@@ -129,11 +134,12 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
         stock = nodes(number, flavor="stock")
         keep = "specular_reflectance"
         plastics = {n: m for n, m in stock.items() if isinstance(m, dict) and m["type"] == "roughplastic"}
-        ours, theirs = (
-            stock | {name: kind(node["alpha"]) | {keep: node[keep]} for name, node in plastics.items()}
-            for kind in (roughconductor.ours, roughconductor.theirs)
-        )
-        return _by_mitsuba(ours, None, extent.spp), _by_mitsuba(theirs, None, extent.spp)
+
+        def side(bsdf: Callable[[float], Nodes]) -> Run:
+            metals = {name: bsdf(node["alpha"]) | {keep: node[keep]} for name, node in plastics.items()}
+            return _by_mitsuba(stock | metals, None, extent.spp)
+
+        return side(roughconductor.ours), side(roughconductor.theirs)
 
     for n in extent.scenes:
         lights = sum(key.startswith("light_") for key in nodes(n))

@@ -40,7 +40,8 @@ def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array
         m /= np.linalg.norm(m, axis=-1, keepdims=True)
         o = 2 * (i * m).sum(axis=-1, keepdims=True) * m - i
         up = o[:, 2] > 0.02
-        wi, wo = np.concatenate([wi, i[up]]), np.concatenate([wo, o[up]])
+        wi = np.concatenate([wi, i[up]])
+        wo = np.concatenate([wo, o[up]])
     return unit(wi[:count]), unit(wo[:count])
 
 

@@ -216,22 +216,28 @@ def _p_of_means(difference: Array) -> float:
     from scipy import stats
 
     side = -(-max(difference.shape) // BLOCKS)
-    near, both = (
-        np.concatenate([(v[1:] * v[:-1]).ravel(), (v[:, 1:] * v[:, :-1]).ravel()])
-        for v in (difference, np.sign(difference))
-    )
+    rows = difference[1:] * difference[:-1]
+    columns = difference[:, 1:] * difference[:, :-1]
+    near = np.concatenate([rows.ravel(), columns.ravel()])
+    both = np.sign(near)
     shared = both.sum() > 3 * np.count_nonzero(both) ** 0.5
     alike = max(near.sum(), 0) / 2 / (difference**2).sum() if shared else 0
-    apart = np.arange(1, 4)  # pixels, and how many of a block's are so far from its end
-    wide, inside = (1 + 2 * (alike**apart**2 * s).sum() for s in (1, np.maximum(1 - apart / side, 0)))
-    count, square, blocks = (
-        cell_sums(v[None, ..., None], side) for v in (np.ones_like(difference), difference**2, difference)
-    )
+    apart = np.arange(1, 4)  # pixels
+    correlation = 2 * alike**apart**2
+    wide = 1 + correlation.sum()
+    inside = 1 + (correlation * np.maximum(1 - apart / side, 0)).sum()  # of a block
+    picture = difference[None, ..., None]
+    count = cell_sums(np.ones_like(picture), side)
+    square = cell_sums(picture**2, side)
+    blocks = cell_sums(picture, side)
     signs = np.random.default_rng(0).integers(2, size=(FLIPS, *blocks.shape[1:])) * 2.0 - 1
-    blocks, least = np.concatenate([blocks, signs * blocks]), np.inf
+    blocks = np.concatenate([blocks, signs * blocks])
+    least = np.inf
     for size in (max(CELL // side, CELL // 2), BLOCKS):
-        pixels, squares, totals = (cell_sums(v, size) for v in (count, square, blocks))
-        share = np.minimum(totals**2 / np.maximum(squares * pixels, 1e-300), 1 - 1e-15)
+        pixels = cell_sums(count, size)
+        squares = cell_sums(square, size)
+        most = np.maximum(squares * pixels, 1e-300)
+        share = np.minimum(cell_sums(blocks, size) ** 2 / most, 1 - 1e-15)
         t = np.sqrt((pixels - 1) * share / (1 - share)).max((1, 2, 3))
         t[0] *= inside / wide
         p = 2 * stats.t.sf(t, max(pixels.max() - 1, 1))

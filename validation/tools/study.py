@@ -179,10 +179,10 @@ def findings(part: Callable[..., None], **options: Any) -> Study:
 # ------------------------------------------------ Timing -----------------------------------------------
 
 
-def timed(run: Callable[[], Item]) -> tuple[Item, float]:
+def timed(run: Callable[..., Item], *arguments: object) -> tuple[Item, float]:
     """The result of a function, and its seconds."""
     start = time.perf_counter()
-    result = run()
+    result = run(*arguments)
     return result, time.perf_counter() - start
 
 

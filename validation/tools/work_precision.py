@@ -285,7 +285,8 @@ def error_vs_time(
     A case that fails is kept, with the reason. Raises ``UsageError`` for wrong arguments, and what
     ``render`` raises for the reference.
     """
-    start, shared = time.perf_counter(), shared or {}
+    start = time.perf_counter()
+    shared = shared or {}
     if not cases or repeats < 1:
         raise UsageError("error_vs_time needs at least one case and one repeat")
     for name, options in {"shared": shared, **cases}.items():
@@ -415,7 +416,8 @@ def _point(
 
 def describe(study: Study, found: Findings, name: str, title: str, truth: str = "") -> None:
     """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is."""
-    prefix, where = (f"{name}-", f"{name}: ") if name else ("", "")
+    prefix = name and f"{name}-"
+    where = name and f"{name}: "
     study.at_most(f"{where}cases that failed", len(found.failed), 0, "each of them could be rendered")
     if found.failed:
         reasons = [{"case": case, "why": why} for case, why in found.failed.items()]

@@ -320,9 +320,11 @@ def _axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Cur
         return (r * height - depth * radius) / np.hypot(height, radius)
 
     stock = None
-    slope, wide = radius / height, 0.0
+    slope = radius / height
+    wide = 0.0
     if kind is Cylinder:
-        slope, wide = 0.0, radius
+        slope = 0.0
+        wide = radius
         stock = {"type": "cylinder", "p0": base, "p1": tip, "radius": radius}
     first = _first_side(rays, tip, along, np.float32(slope), np.float32(wide))
     thing = kind(tuple(tip.tolist()), tuple(base.tolist()), radius, MIRROR)

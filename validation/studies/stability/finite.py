@@ -56,7 +56,8 @@ def blurs() -> Iterator[Case]:
     yield Case("range of a blur", what, "not at all", excess, MEAN)
     what = "other pixels that are not finite afterwards, and this one where it is hidden"
     yield Case("nan or inf in a picture, blur", what, "damage stays local, and to be seen", damage, 0)
-    image, depth = (np.float32(10 ** rng.uniform(*s)) for s in ((-38, 34, (20, 20, 3)), (-30, 30, (20, 20))))
+    image = np.float32(10 ** rng.uniform(-38, 34, (20, 20, 3)))
+    depth = np.float32(10 ** rng.uniform(-30, 30, (20, 20)))
     settings = product(MODES, (1e-30, 1.0, 1e30), (0.0, 1e-30, 1e30, np.inf))
     found = [_blurred(image, depth, *setting) for setting in settings]
     what = "values that are not finite, pictures 1e-38 … 1e34, depths 1e-30 … 1e30"
@@ -97,7 +98,7 @@ AT_ONCE = 2_500_000
 TINY = 1e-45
 NORMAL = 1.2e-38
 _ZERO_UP = (0, TINY, NORMAL, 1e-20, 1e-8, 1e-4, 0.1, 1, 1e2, 1e6, 3e38, np.inf, np.nan)
-ALPHAS: tuple[float, ...] = (*_ZERO_UP, *(-a for a in _ZERO_UP[1:-1]))
+ALPHAS = (*_ZERO_UP, *(-a for a in _ZERO_UP[1:-1]))
 IORS = (1, 1 + 1.2e-7, 1 - 6e-8, TINY, NORMAL, 1e-3, 1e6, 1e9, 3e38, np.inf, np.nan, 0, -1)
 COSINES = (1, 1 - 6e-8, 0.5, 1e-3, 1e-7, 1e-12, 1e-20, NORMAL, TINY, 0, -TINY, -1e-7, -0.5, -1)
 NUMBERS = (0, 1, -1, TINY, -TINY, NORMAL, 1e-20, 1e-7, -1e-7, 0.5, 2, 1e3, -1e6)

@@ -78,7 +78,7 @@ def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
 
 
 FULL: Options = {"fresnel": "unity"}
-OPEN: Options = {"clamp": False}
+OPEN = {"clamp": False}
 
 
 @dataclass(frozen=True)
