@@ -18,7 +18,8 @@ from .snapshot import Kept, Snapshot
 from .variants import is_jit, varies
 
 # Beyond these sizes, Embree's products of three lengths leave float32
-SMALLEST_MESH, LARGEST_MESH = 1e-8, 1e10
+SMALLEST_MESH = 1e-8
+LARGEST_MESH = 1e10
 
 
 class Reading:
@@ -32,11 +33,12 @@ class Reading:
 
     def __init__(self, snapshot: Snapshot, kept: Kept) -> None:
         self.snapshot = snapshot
-        shapes, materials, lights = snapshot.shape_part, snapshot.material_part, snapshot.light_part
-        plane, exact_mesh = plugin("plane").MrtPlane, plugin("exact_mesh").ExactMesh
+        shapes = snapshot.shape_part
+        materials = snapshot.material_part
+        lights = snapshot.light_part
         known = [s for s in snapshot.shapes if is_known(s)]
-        self.planes = [s for s in known if isinstance(s, plane)]
-        self.quadrics = [s for s in known if isinstance(s, exact_mesh)]
+        self.planes = [s for s in known if isinstance(s, plugin("plane").MrtPlane)]
+        self.quadrics = [s for s in known if isinstance(s, plugin("exact_mesh").ExactMesh)]
         analytic = {id(s) for s in (*self.planes, *self.quadrics)}
         self.native = [s for s in snapshot.shapes if id(s) not in analytic]
         #: the rows of the materials by shape, none where they have no place in one table
@@ -117,17 +119,20 @@ def _light_rows(lights: list[mi.Emitter]) -> list[list[list[float]]] | None:
 
 def _read_materials(snapshot: Snapshot) -> tuple[list[np.ndarray], dict[str, Any]]:
     """Return the materials as rows of a table, none where they have no place in one, and the facts."""
-    bsdfs, outcome = snapshot.bsdfs, material_rows(snapshot.shapes)
+    bsdfs = snapshot.bsdfs
+    outcome = material_rows(snapshot.shapes)
     unmergeable = outcome if isinstance(outcome, str) else ""
     rows = [] if isinstance(outcome, str) else outcome
-    # Those outside the table may have any lobe
-    lobes = [
-        (lobe.name, bool(unmergeable) or any(row[1 + k].any() for row in rows))
-        for k, lobe in enumerate(LOBES)
-    ]
+    lobes = []
+    for k, lobe in enumerate(LOBES, start=1):  # materials outside the table may have any
+        present = bool(unmergeable) or any(row[k].any() for row in rows)
+        lobes.append((lobe.name, present))
+    mirrors = []
+    for bsdf in filter(has_mirror, bsdfs):
+        mirrors.append(bsdf.mirror_bound() if is_mrt_bsdf(bsdf) else Mirror(1.0, 1.0))
     facts = {
         "lobes": tuple(lobes),
-        "mirrors": tuple(_mirror_bound(b) for b in bsdfs if has_mirror(b)),
+        "mirrors": tuple(mirrors),
         "oriented": any(map(is_oriented, bsdfs)),
         "textured": bool(unmergeable) and any(map(is_textured, bsdfs)),
         "two_sided": any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs),
@@ -144,10 +149,6 @@ def is_mrt_bsdf(bsdf: mi.BSDF) -> bool:
 def has_mirror(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF reflects like a mirror."""
     return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
-
-
-def _mirror_bound(bsdf: mi.BSDF) -> Mirror:
-    return bsdf.mirror_bound() if is_mrt_bsdf(bsdf) else Mirror(1.0, 1.0)
 
 
 def is_textured(bsdf: mi.BSDF) -> bool:

@@ -24,9 +24,13 @@ def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
     ds.dist = dr.norm(ds.d)
     # A point on the light itself has no direction to it; any will do, and scalar variants raise on 0/0
     away = ds.dist > 0
-    ds.d = dr.select(away, ds.d * (1 / dr.select(away, ds.dist, 1)), mi.Vector3f(0, 0, 1))
-    ds.n, ds.uv, ds.time = mi.Normal3f(-ds.d), mi.Point2f(0), it.time
-    ds.pdf, ds.delta = mi.Float(1), mi.Bool(True)
+    inverse = 1 / dr.select(away, ds.dist, 1)
+    ds.d = dr.select(away, ds.d * inverse, mi.Vector3f(0, 0, 1))
+    ds.n = mi.Normal3f(-ds.d)
+    ds.uv = mi.Point2f(0)
+    ds.time = it.time
+    ds.pdf = mi.Float(1)
+    ds.delta = mi.Bool(True)
     return ds
 
 
@@ -64,11 +68,14 @@ class Lights:
             one = called[light] if self.unrolled else dr.gather(mi.EmitterPtr, called, light, active)
             return one.sample_direction(it, sample, active)
         if self.unrolled:
-            kinds, row = [self.kinds[self.kind_of[light]]], self.rows[light]
+            kinds = [self.kinds[self.kind_of[light]]]
+            row = self.rows[light]
         else:
-            kinds, row = self.kinds, [part(light, active) for part in self.parts[1:]]
+            kinds = self.kinds
+            row = [part(light, active) for part in self.parts[1:]]
             kind = self.parts[0](light, active).x if len(kinds) > 1 else None
-        ds, channels = towards(mi.Point3f(row[0]), it), dr.size_v(mi.UnpolarizedSpectrum)
+        ds = towards(mi.Point3f(row[0]), it)
+        channels = dr.size_v(mi.UnpolarizedSpectrum)
         row = [mi.UnpolarizedSpectrum(list(row[1])[:channels]), *row[2:]]
         arriving = kinds[0].arriving(ds.d, *row)
         for k, other in enumerate(kinds[1:], start=1):
@@ -86,8 +93,10 @@ def brightness(emitter: mi.Emitter) -> float:
         return np.inf
     parameters = mi.traverse(emitter)
     if emitter.class_name() == "EnvironmentMapEmitter":
-        data, scale = parameters["data"], parameters["scale"]
-        known = not dr.grad_enabled(data, scale)
-        return float(np.max(np.array(data)[..., :3]) * np.max(np.array(scale))) if known else np.inf
+        data = parameters["data"]
+        scale = parameters["scale"]
+        if dr.grad_enabled(data, scale):
+            return np.inf
+        return float(np.array(data)[..., :3].max() * np.array(scale).max())
     values = [largest(node) for node in parameters.hierarchy if isinstance(node, mi.Texture)]
     return max(values, default=np.inf)

@@ -129,19 +129,21 @@ class Snapshot:
     def __init__(self, scene: mi.Scene, before: Snapshot | None = None) -> None:
         """Look at a scene; parts that have not changed since ``before`` are taken from there."""
         # Not the scene itself: it owns the integrator, which owns this, and such a ring is never freed
-        self.shapes, self.emitters, self.environment = scene.shapes(), scene.emitters(), scene.environment()
+        self.shapes = scene.shapes()
+        self.emitters = scene.emitters()
+        self.environment = scene.environment()
         self.eye = _eye(scene)
         # Groups are traced through their instances, which don't say what group they belong to
         inside = [value for _, value, _ in parameters_of(scene) if isinstance(value, mi.Shape)]
         self.groups = [shape for shape in inside if shape.class_name().startswith("ShapeGroup")]
         #: the shapes of the groups
         self.inner = [v for g in self.groups for _, v, _ in parameters_of(g) if isinstance(v, mi.Shape)]
-        shapes, materials, lights = Part(), Part(), Part()
+        shapes = Part()
+        materials = Part()
+        lights = Part()
         for shape in [*self.shapes, *self.groups, *self.inner]:
-            shapes.add(
-                shape, (mi.Shape, mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium),
-                shape.has_flipped_normals(), shape.is_emitter(),
-            )  # fmt: skip
+            elsewhere = (mi.Shape, mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium)
+            shapes.add(shape, elsewhere, shape.has_flipped_normals(), shape.is_emitter())
         bsdfs = [shape.bsdf() for shape in [*self.shapes, *self.inner]]
         materials.state += map(id, bsdfs)
         self.bsdfs = list({id(b): b for b in bsdfs if b is not None}.values())  #: each material once

@@ -37,7 +37,15 @@ def reserved(folder: str) -> Iterator[tuple[str, dict[str, Facts]]]:
     with contextlib.ExitStack() as stack:
         try:
             alone = stack.enter_context(_locked(folder))
-            notes = _clear(folder) if alone else {}
+            notes = dict[str, Facts]()
+            for left in Path(folder).iterdir() if alone else ():  # of killed sweeps
+                if left.is_symlink() or not re.fullmatch(f"{re.escape(_SCRATCH)}[a-z0-9_]{{8}}", left.name):
+                    continue
+                for note in left.glob("*.json"):
+                    noted = read_note(note)
+                    if "file" in noted:
+                        notes[noted["file"]] = noted
+                shutil.rmtree(left, ignore_errors=True)
             scratch = stack.enter_context(temporary_folder(folder, _SCRATCH))
         except OSError as error:
             raise OutputError(f"cannot write to the folder {folder}: {error.strerror or error}") from error
@@ -81,20 +89,6 @@ def _locked(folder: str) -> Iterator[bool]:
         if file is not None:
             fcntl.flock(file, fcntl.LOCK_UN)  # also for a child process that has the file open
             os.close(file)
-
-
-def _clear(folder: str) -> dict[str, Facts]:
-    """Remove the folders of killed sweeps; returns their notes as ``reserved`` does."""
-    facts: dict[str, Facts] = {}
-    for left in Path(folder).iterdir():
-        if not re.fullmatch(re.escape(_SCRATCH) + "[a-z0-9_]{8}", left.name) or left.is_symlink():
-            continue
-        for note in left.glob("*.json"):
-            noted = read_note(note)
-            if "file" in noted:
-                facts[noted["file"]] = noted
-        shutil.rmtree(left, ignore_errors=True)
-    return facts
 
 
 def read_note(path: str | Path) -> Facts:
