@@ -294,6 +294,9 @@ def roundoff(law: Law, case: Case) -> None:
         raise Skip("too few pairs of directions with a value")
     inputs = np.concatenate([few.wi, few.wo], axis=1)
 
+    def both_unit(x: Array) -> Array:
+        return probe.unit(x.reshape(-1, 2, 3).astype(np.float64)).reshape(-1, 6)
+
     def brightest(wi: Array, wo: Array, uv: Array) -> Array:
         return case.eval(wi, wo, uv).max(axis=1)
 
@@ -302,12 +305,7 @@ def roundoff(law: Law, case: Case) -> None:
         def at(x: Array, function: Callable[..., Array] = function) -> Array:
             return function(x[:, :3], x[:, 3:], np.tile(few.uv, (len(x) // len(few.uv), 1)))
 
-        estimate = noise.measure(at, inputs, seed=case.seed, project=_both_unit)
+        estimate = noise.measure(at, inputs, seed=case.seed, project=both_unit)
         if np.isnan(estimate.noise).mean() > 0.25:
             raise Skip("values change too fast for float32 steps to tell noise")
         law.hold("lost", estimate.lost, few, function=name, stride=estimate.stride)
-
-
-def _both_unit(x: Array) -> Array:
-    """Pairs of directions [N, 6], each made one unit long."""
-    return probe.unit(x.reshape(-1, 2, 3).astype(np.float64)).reshape(-1, 6)

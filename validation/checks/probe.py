@@ -171,7 +171,13 @@ def lanes(call: Call, *columns: tuple[str, Array]) -> list[Array]:
     with dr.suspend_grad():
         values = _values(call, [as_mitsuba(kind, column) for kind, column in columns])
         dr.eval(values)
-    return [_as_numpy(value, count) for value in values]
+    arrays = []
+    for value in values:
+        if dr.depth_v(value) == 1:
+            arrays.append(np.broadcast_to(np.array(value), count))
+        else:  # sums over channels are quicker so
+            arrays.append(np.array([np.broadcast_to(np.array(channel), count) for channel in value]).T)
+    return arrays
 
 
 def _values(call: Call, arguments: Sequence[Any]) -> list[Any]:
@@ -179,14 +185,6 @@ def _values(call: Call, arguments: Sequence[Any]) -> list[Any]:
     values = call(*arguments)
     several = values if isinstance(values, list | tuple) else [values]
     return [mi.unpolarized_spectrum(value) if dr.is_matrix_v(value) else value for value in several]
-
-
-def _as_numpy(value: Any, count: int) -> Array:
-    """An array of Dr.Jit as [count] or [count, k]."""
-    if dr.depth_v(value) == 1:
-        return np.broadcast_to(np.array(value), count)
-    # sums over channels are quicker so
-    return np.array([np.broadcast_to(np.array(channel), count) for channel in value]).T
 
 
 def as_mitsuba(kind: str, column: Array) -> Any:

@@ -154,15 +154,14 @@ def _ends(found: Findings) -> dict[str, tuple[float, float, str]]:
     """Return the last point of each curve, and its colour."""
     colors = _colors(found)
     bottom = _bottom(found)
-    last = {name: curve[-1] for name, curve in found.families.items()}
-    return {_curve(p): (p.seconds, _shown_error(p, bottom), colors[name]) for name, p in last.items()}
-
-
-def _curve(point: Point) -> str:
-    """Return the name of a point's curve, without names that only numbers followed."""
-    family = point.family.replace("%", "").split()
-    words = [word for word in family if f"{word}=" not in point.name]
-    return " ".join(words or family)
+    ends = {}
+    for family, curve in found.families.items():
+        last = curve[-1]
+        words = family.replace("%", "").split()
+        # without names that only numbers followed
+        shown = [word for word in words if f"{word}=" not in last.name]
+        ends[" ".join(shown or words)] = (last.seconds, _shown_error(last, bottom), colors[family])
+    return ends
 
 
 def _draw_curves(axes: Axes, found: Findings) -> None:

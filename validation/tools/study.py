@@ -151,6 +151,10 @@ class Study:
 
     def summary(self) -> Values:
         """The study in values of JSON; infinite and undefined numbers become text."""
+
+        def plain(value: object) -> object:
+            return value.item() if isinstance(value, np.generic) else str(value)
+
         found = {
             "title": self.title,
             "bounds": [bound.as_dict() for bound in self.bounds],
@@ -161,12 +165,8 @@ class Study:
             "failure": self.failure,
             "seconds": round(self.seconds, 2),
         }
-        text = json.dumps(found, default=_plain)
+        text = json.dumps(found, default=plain)
         return dict(json.loads(text, parse_constant=str))
-
-
-def _plain(value: object) -> object:
-    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def findings(part: Callable[..., None], **options: Any) -> Study:

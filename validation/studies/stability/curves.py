@@ -151,7 +151,13 @@ def _pairs(count: int, cosine: Array, alpha: float) -> tuple[Array, Array]:
 
 def _lobes(wi: Array, wo: Array, alpha: float) -> Curves:
     """The roundings of the lobe D G / (4 cos θi), without Fresnel."""
-    truth = np.array([_exact_lobe(*pair, alpha) for pair in zip(wi, wo, strict=True)])
+    truth = []
+    exactly = exact.number(np.float32(alpha))
+    for i, o in zip(wi, wo, strict=True):
+        x, y, z = (exact.number(p) + exact.number(q) for p, q in zip(i, o, strict=True))
+        cosine = 1 / exact.mp.sqrt(1 + (x * x + y * y) / (z * z))
+        shadowing = exact.smith_g1(i, exactly) * exact.smith_g1(o, exactly)
+        truth.append(float(exact.beckmann_d(cosine, exactly) * shadowing / (4 * exact.number(i[2]))))
     lobes = {name: evaluate(mi.load_dict(of(alpha)), wi, wo)[0][:, 0] for name, of in BSDFS.items()}
     # as the report has it, of cosines alone, in float32
     a = np.float32(alpha)
@@ -159,15 +165,7 @@ def _lobes(wi: Array, wo: Array, alpha: float) -> Curves:
     d = np.exp((c**2 - 1) / (c**2 * a**2)) / (np.float32(np.pi) * a**2 * c**4)
     g = _first_g1(wi[:, 2], a) * _first_g1(wo[:, 2], a)
     lobes[FIRST] = d * g / (4 * wi[:, 2] * wo[:, 2]) * wo[:, 2]
-    return _off(lobes, truth)
-
-
-def _exact_lobe(wi: Array, wo: Array, alpha: float) -> float:
-    a = exact.number(np.float32(alpha))
-    x, y, z = (exact.number(p) + exact.number(q) for p, q in zip(wi, wo, strict=True))
-    cosine = 1 / exact.mp.sqrt(1 + (x * x + y * y) / (z * z))
-    g = exact.smith_g1(wi, a) * exact.smith_g1(wo, a)
-    return float(exact.beckmann_d(cosine, a) * g / (4 * exact.number(wi[2])))
+    return _off(lobes, np.array(truth))
 
 
 def _first_g1(cosine: Array, alpha: np.float32) -> Array:
