@@ -139,8 +139,8 @@ def _matching(folders: Iterable[str], prefix: str) -> Iterator[str]:
 
 def version_in_name(path: str) -> Version | None:
     """Return the version in a file name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1, or None."""
-    found = re.fullmatch(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.so(?:\.(\d+(?:\.\d+)*))?", os.path.basename(path))
-    numbers = found and (found[1] or found[2])
+    name = re.fullmatch(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.so(?:\.(\d+(?:\.\d+)*))?", os.path.basename(path))
+    numbers = name and (name[1] or name[2])
     return tuple(map(int, numbers.split("."))) if numbers else None
 
 
@@ -206,8 +206,8 @@ def problem(choice: Choice) -> str | None:
     loaded = dr.detail.llvm_version()[0]
     if loaded >= OLDEST:
         return None
-    found = f"LLVM {loaded}, with which it would abort," if loaded > 0 else "no LLVM"
+    library = f"LLVM {loaded}, with which it would abort," if loaded > 0 else "no LLVM"
     return (
-        f"Dr.Jit loaded {found} in place of {choice.path}. Import mrt_mitsuba before mitsuba and drjit, or "
+        f"Dr.Jit loaded {library} in place of {choice.path}. Import mrt_mitsuba before mitsuba and drjit, or "
         f"set {VARIABLE} to a libLLVM of version {OLDEST} or newer."
     )

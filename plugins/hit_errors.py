@@ -46,15 +46,15 @@ class HitErrors:
             rows = [curved if t is None else _sizes_across(t) for t in triangles]
             self.flat = ByShape(mi.Vector4f, shapes, rows, curved)
 
-    def size(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float:
+    def size(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
         """Return the largest coordinate of the shape."""
-        return mi.Float(0) if self.sizes is None else self.sizes(si, found)
+        return mi.Float(0) if self.sizes is None else self.sizes(si, active)
 
-    def of_flat(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> mi.Float | None:
+    def of_flat(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float | None:
         """Return the bound at a hit on a flat shape; inf on a curved one, None where all are."""
         if self.flat is None:
             return None
-        row = self.flat(si, found)
+        row = self.flat(si, active)
         width = mi.Vector3f(row.x, row.y, row.z)
         return FLAT * (dr.dot(dr.abs(si.n), dr.abs(si.p) + width) + row.w)
 

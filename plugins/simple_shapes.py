@@ -35,14 +35,14 @@ class Planes:
         """Return the distance of the nearest plane, or ``ray.maxt``, its number, and if there is one."""
         t = mi.Float(ray.maxt)
         index = mi.UInt32(0)
-        found = mi.Bool(False)
+        hit = mi.Bool(False)
         for k, (normal, distance) in enumerate(self.equations):
             t_plane = intersect_plane(ray.o, ray.d, normal, distance)
             closer = active & (t_plane < t)
             t = dr.select(closer, t_plane, t)
             index = dr.select(closer, mi.UInt32(k), index)
-            found = found | closer
-        return t, index, found
+            hit = hit | closer
+        return t, index, hit
 
     def separate(self, p: mi.Point3f, q: mi.Point3f) -> mi.Bool:
         """Return whether there is a plane between two points."""
@@ -101,41 +101,43 @@ class Spheres:
         self.by_shape = ByShape(mi.Vector4f, shapes, [center_and_radius(s) for s in shapes], [0.0] * 4)
 
     def interaction(
-        self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, found: mi.Bool
+        self, pi: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
     ) -> tuple[mi.SurfaceInteraction3f, mi.Float]:
         """Return the interaction with a sphere, and the size of its coordinates, for scenes of spheres only.
 
         Derivatives and texture coordinates are left out.
         """
         si = dr.zeros(mi.SurfaceInteraction3f)
-        si.t = dr.select(found, pi.t, dr.inf)
-        si.shape = dr.select(found, pi.shape, None)
-        center, radius = self._center_and_radius(si, found)
+        si.t = dr.select(active, pi.t, dr.inf)
+        si.shape = dr.select(active, pi.shape, None)
+        center, radius = self._center_and_radius(si, active)
         n = dr.normalize(dr.fma(ray.d, pi.t, ray.o) - center)
         si.p = dr.fma(n, radius, center)
         si.n = si.sh_frame.n = mi.Normal3f(n)
         return si, dr.max(dr.abs(center)) + radius
 
-    def put_back(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> None:
+    def put_back(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> None:
         """Move hits on spheres onto them, along the radius."""
-        center, radius = self._center_and_radius(si, found)
+        center, radius = self._center_and_radius(si, active)
         p = dr.detach(si.p)
         v = p - center
         length = dr.norm(v)
-        on_sphere = found & (radius > 0) & (length > 0)
+        on_sphere = active & (radius > 0) & (length > 0)
         # A shift without a derivative: how the hit moves with the sphere is for Mitsuba to say
         scale = radius / dr.select(on_sphere, length, 1)
         si.p += dr.select(on_sphere, center + v * scale - p, 0)
 
-    def _center_and_radius(self, si: mi.SurfaceInteraction3f, found: mi.Bool) -> tuple[mi.Point3f, mi.Float]:
-        row = self.by_shape(si, found)
+    def _center_and_radius(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Point3f, mi.Float]:
+        row = self.by_shape(si, active)
         return mi.Point3f(row.x, row.y, row.z), row.w
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray, bool]:
         """Return the boxes [n, 2, 3] of the spheres, their numbers, and that they are balls; they are then
         ready for ``block``."""
-        found = [(s, next(e for e in parameters_of(s) if e[0] == "to_world")) for s in self.shapes]
-        frames = [mi.get_property(value, kind, s).matrix for s, (_, value, kind) in found]
+        frames = []
+        for shape in self.shapes:
+            value, kind = next(how for name, *how in parameters_of(shape) if name == "to_world")
+            frames.append(mi.get_property(value, kind, shape).matrix)
         numbers = np.array([[first(m[row][column]) for row in range(3) for column in (0, 3)] for m in frames])
         # To the last bit, which Mitsuba's boxes do not have
         centers = numbers[:, 1::2]

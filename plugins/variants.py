@@ -163,10 +163,10 @@ class ByShape:
         self.size = dr.opaque(mi.UInt32, size)
         dr.make_opaque(self.fallback)
 
-    def __call__(self, si: mi.SurfaceInteraction3f, found: mi.Bool, part: int = 0) -> Any:
+    def __call__(self, si: mi.SurfaceInteraction3f, active: mi.Bool, part: int = 0) -> Any:
         if not is_jit():
-            return self.rows.get(id(si.shape), self.fallback) if found else self.fallback
+            return self.rows.get(id(si.shape), self.fallback) if active else self.fallback
         ids = dr.reinterpret_array(mi.UInt32, si.shape)
-        known = found & (ids < self.size)
+        known = active & (ids < self.size)
         index = ids * self.parts + part
         return dr.select(known, dr.gather(self.kind, self.table, index, known), self.fallback)

@@ -68,13 +68,13 @@ def is_fresh(job: Job, folder: str, noted: Facts | None, png: bool = False) -> b
     fresh = True
     for file, known in itertools.zip_longest(job.files(png), sums[: len(job.files(png))], fillvalue=""):
         path = os.path.join(folder, file)
-        found = mark(path)
+        marked = mark(path)
         # A file without a mark is what damage left of the noted one if it is no picture at all, or as long
-        damaged = os.path.isfile(path) and (found is None or known.endswith(f"/{os.path.getsize(path)}"))
-        if os.path.lexists(path) and not found and (noted is None or not damaged):
+        damaged = os.path.isfile(path) and (marked is None or known.endswith(f"/{os.path.getsize(path)}"))
+        if os.path.lexists(path) and not marked and (noted is None or not damaged):
             text = "was not made by a sweep, which would replace it: move it away, or choose another folder"
             raise OutputError(f"{path} {text}")
-        fresh = fresh and found == job.made_with and checksum(path) == known
+        fresh = fresh and marked == job.made_with and checksum(path) == known
     return fresh
 
 
