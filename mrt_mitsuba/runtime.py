@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import warnings
+from collections.abc import Iterator
 from functools import cache
 
 import drjit as dr
@@ -60,6 +61,17 @@ def use(variant: str | None = None) -> str:
         plugins.register_modules("mrt_mitsuba.rendering", ["adaptive"])
         _used = variant
     return variant
+
+
+@contextlib.contextmanager
+def within(variant: str) -> Iterator[None]:
+    """Make a variant current for a block."""
+    before = mi.variant()
+    use(variant)
+    try:
+        yield
+    finally:
+        use(before)
 
 
 def register(guard: bool = True) -> None:

@@ -109,7 +109,9 @@ class MrtAdaptive(mi.SamplingIntegrator):
             planes = [*colors, *alpha, np.ones_like(result.image[..., 0]), *(layers[name] for name in names)]
             film.prepare(names)
             values = mi.TensorXf(np.ascontiguousarray(np.stack(planes, -1), np.float32))
-            film.put_block(mi.ImageBlock(values, film.crop_offset(), film.rfilter(), border=False))
+            film.put_block(
+                mi.ImageBlock(tensor=values, offset=film.crop_offset(), rfilter=film.rfilter(), border=False)
+            )
             return self._seen(film.develop()) if develop else mi.TensorXf()
 
     def sample(self, *_: Any) -> Any:

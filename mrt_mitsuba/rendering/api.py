@@ -147,17 +147,19 @@ def render(scene: Any = 0, **options: Any) -> Result:
         return render_source(open_with(scene, settings, job), settings, job)
 
 
-@contextmanager
-def session(settings: RenderSettings) -> Iterator[Job]:
-    """Let one render run alone, in the variant that the settings name, and measure what it costs.
-
-    Raises ``UsageError`` inside a function that ``dr.freeze`` records.
-    """
+def refuse_freezing() -> None:
+    """Raise ``UsageError`` inside a function that ``dr.freeze`` records."""
     if dr.flag(dr.JitFlag.FreezingScope):
         raise UsageError(
             "a render cannot be recorded by dr.freeze: it decides by what it has traced. Call it outside of "
-            "the frozen function, or use mrt.prepare(scene), which records the kernels of a render"
+            "the frozen function; what mrt.prepare(scene) returns has recorded kernels of its own"
         )
+
+
+@contextmanager
+def session(settings: RenderSettings) -> Iterator[Job]:
+    """Let one render run alone, in the variant that the settings name, and measure what it costs."""
+    refuse_freezing()
     with runtime.one_at_a_time, held(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         budget = Budget.of(cast("int | None", settings.memory))

@@ -14,7 +14,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.plugins.snapshot import Part
-from mrt_mitsuba.rendering.api import Result, open_with, render_source, session
+from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import camera_matrices
 
@@ -42,8 +42,8 @@ class Prepared:
 
     def __call__(self, seed: int = 0) -> Result:
         """Render the scene as it is now; ``seed`` is of all random numbers."""
-        with runtime.one_at_a_time, held():
-            runtime.use(self._made.plan.variant)
+        refuse_freezing()
+        with runtime.one_at_a_time, held(), runtime.within(self._made.plan.variant):
             self.params.update()
             self._resize()
             if self._launch is None:

@@ -53,7 +53,14 @@ def test_a_render_inside_freeze_is_refused_with_the_way_out():
     def by_us(factor):
         return mi.TensorXf(mrt.render(scene, integrator="path", spp=2).image) * factor
 
-    for frozen in (by_mitsuba, by_us):
+    report_scene = mi.load_dict(mrt.scene_dict(3))
+    again = mrt.prepare(report_scene, width=8, height=6, aa=1, aamode="none")
+
+    @dr.freeze
+    def by_recorded(factor):
+        return mi.TensorXf(again().image) * factor
+
+    for frozen in (by_mitsuba, by_us, by_recorded):
         with pytest.raises(RuntimeError) as caught:
             frozen(mi.Float(1))
         first = caught.value

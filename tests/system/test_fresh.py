@@ -178,3 +178,11 @@ def test_a_size_of_the_film_and_one_by_option_contradict_each_other(variant):
         again()
     again.params[key] = size
     assert_array_equal(again().image, before)
+
+
+def test_a_prepared_scene_leaves_the_variant(variant):
+    again = mrt.prepare(mi.load_dict(mrt.scene_dict(3)), width=8, height=6, aa=1, aamode="none")
+    before = again().image
+    mi.set_variant("scalar_rgb")
+    assert_array_equal(again().image, before)
+    assert mi.variant() == "scalar_rgb"

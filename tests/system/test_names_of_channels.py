@@ -15,10 +15,10 @@ import mrt_mitsuba as mrt
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def scene(integrator: dict[str, Any]) -> mi.Scene:
+def scene(integrator: dict[str, Any], size: tuple[int, int] = (8, 6)) -> mi.Scene:
     nodes: dict[str, Any] = {"type": "scene", "integrator": integrator, "sky": {"type": "constant"}}
     nodes["ball"] = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 0.4}}
-    return mi.load_dict(nodes | {"sensor": sensor([0, 1, 6], [0, 0, 0], (8, 6), fov=25)})
+    return mi.load_dict(nodes | {"sensor": sensor([0, 1, 6], [0, 0, 0], size, fov=25)})
 
 
 def of_the_user(names: str) -> dict[str, Any]:
@@ -106,3 +106,19 @@ def test_integrators_without_to_string(door):
         "target": lambda: mrt.render(loaded, target="2%").image,
     }
     assert_allclose(doors[door](), 0.25, rtol=1e-5)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 2)])
+def test_the_smallest_films_print_nothing(variant, size, capfd):
+    """A picture of so few numbers was first taken for the size of one, with a complaint on the terminal."""
+    inside = {"type": "mrt_adaptive", "spp": 8, "nested": {"type": "path"}}
+    for integrator in (inside, {"type": "mrt_whitted"}):
+        loaded = scene(integrator, size)
+        for picture in (
+            mi.render(loaded, spp=16),
+            mrt.render(loaded).image,
+            mrt.prepare(loaded)().image,
+        ):
+            assert np.shape(picture)[:2] == size[::-1]
+    assert "nanobind" not in "".join(capfd.readouterr())
