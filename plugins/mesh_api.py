@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from .intersect import Frame
-from .parameters import ParameterError
+from .parameters import ParameterError, transform
 from .variants import is_jit
 
 
@@ -40,7 +40,7 @@ class Placement:
     """The effect of ``to_world`` on frames. Raises ``ParameterError`` for one that flattens space."""
 
     def __init__(self, props: mi.Properties) -> None:
-        matrix = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, np.float64)
+        matrix = transform(props, "to_world")
         linear = matrix[:3, :3]
         determinant = np.linalg.det(linear) if np.isfinite(matrix).all() else 0
         if determinant == 0:

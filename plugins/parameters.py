@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 import drjit as dr
+import numpy as np
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -92,6 +93,16 @@ def vector(
     if nonzero and not any(numbers):
         _fail(props, name, value, "a vector of non-zero length")
     return numbers
+
+
+def transform(props: mi.Properties, name: str) -> np.ndarray:
+    """Return the matrix of a transform, float64 [4, 4]; the identity by default."""
+    if name not in props:
+        return np.eye(4)
+    value = props[name]
+    if "Transform" not in type(value).__name__:  # it has several classes, and arrays have any attribute
+        _fail(props, name, value, "a transform")
+    return np.array(value.matrix, np.float64)
 
 
 def spectrum(

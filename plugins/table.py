@@ -21,7 +21,7 @@ class Plugin:
     module: str
     class_name: str
     kind: str  #: what it is to Mitsuba: "bsdf", "emitter", "integrator", "shape" or "texture"
-    #: parameters of a small one, but for those with defaults; arrays stand for bitmaps
+    #: the parameters without defaults, for a small example; arrays stand for bitmaps
     sample: Mapping[str, Any]
     #: the table of the kernels of ``mrt_whitted`` that its numbers go into: "lights", "materials", "planes",
     #: "quadrics", or "" for none

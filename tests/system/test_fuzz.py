@@ -17,6 +17,7 @@ from nodes import example
 from PIL import Image
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba import plugins
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.plugins.table import PLUGINS
 from mrt_mitsuba.scene.open import open_scene
@@ -131,13 +132,6 @@ def test_any_picture_is_read_or_refused(tmp_path, variant, changes, cut, mend):
         assert min(texture.resolution()) > 0
 
 
-AXIAL = {"radius": 1.0, "capped": True, "segments": 8}
-OPTIONAL = {"mrt_cone": AXIAL, "mrt_cylinder": AXIAL, "mrt_light": {"position": [0, 0, 1], "intensity": 1.0}}
-OPTIONAL["mrt_bsdf"] = {"alpha": 0.1, "int_ior": 1.5, "ext_ior": 1.0, "fresnel": "schlick", "f0": 0.04}
-OPTIONAL["mrt_bsdf"] |= {"diffuse_reflectance": 0.5, "specular_reflectance": 1.0}
-OPTIONAL["mrt_plane"] = {"distance": 0.0, "extent": 1.0}
-OPTIONAL["mrt_whitted"] = {"max_depth": 3, "clamp": True, "min_contribution": 0.0, "sky": 1.0}
-OPTIONAL["mrt_whitted"] |= {"bounce_budget": "plain"}
 numbers = st.one_of(st.floats(width=32), st.floats(), st.sampled_from([0.0, -1.0, 1e39, math.nan, math.inf]))
 vectors = st.lists(numbers, min_size=3, max_size=3)
 colors = st.builds(lambda x: {"type": "rgb", "value": [x, 0.5, 0.5]}, numbers)
@@ -145,15 +139,21 @@ simple = st.booleans() | st.integers(-3, 300) | st.text(max_size=6)
 values = numbers | simple | vectors | colors
 
 
+def documented(row):
+    """The parameters of a plugin, as the table in the docstring of its class names them."""
+    docstring = getattr(plugins.plugin(row.module), row.class_name).__doc__
+    _, *tables, _ = re.split(r"^ *=+ =.*$", docstring, flags=re.MULTILINE)
+    return re.findall(r"^ *``(\w+)``", "".join(tables), flags=re.MULTILINE)
+
+
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_parameter_is_taken_or_refused_by_name(variant, data):
     row = data.draw(st.sampled_from(PLUGINS))
     plugin = row.name
-    optional = OPTIONAL.get(plugin, {})
-    name = data.draw(st.sampled_from(sorted({*row.sample, *optional})))
+    name = data.draw(st.sampled_from(documented(row)))
     try:
-        mi.load_dict(example(row, **{**optional, name: data.draw(values)}))
+        mi.load_dict(example(row, **{name: data.draw(values)}))
     except (RuntimeError, TypeError) as error:
         text = str(error)
         assert plugin in text or name in text

@@ -14,6 +14,7 @@ from cases import Cases
 from nodes import group, mesh, rgb, sensor
 
 from mrt_mitsuba.plugins.kernel_plan import RULES, KernelPlan, contents
+from mrt_mitsuba.plugins.table import names_in
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -136,7 +137,7 @@ UNCLAMPED = {"type": "mrt_whitted", "clamp": False}
 SHALLOW = {"type": "mrt_whitted", "max_depth": 1}
 ROUGH_IN_PLACES = {**SPHERE, "bsdf": {"type": "mrt_bsdf", "alpha": TEXTURE}}
 OTHER_SHAPES = "other shapes, or spheres that emit or face inwards"
-OTHER_LIGHT = "a light other than mrt_light, or one with derivatives"
+OTHER_LIGHT = f"a light other than {names_in('lights')}, or one with derivatives"
 reason("bvh", "no shapes but analytic ones", a=CONE)
 reason("coherent", "no mesh in the scene", a=SPHERE)
 reason("spheres", "no sphere in the scene", a=MESH)

@@ -68,7 +68,7 @@ def test_a_parameter_is_used_or_refused(row, name):
 
 def test_reasons_name_the_plugins_of_the_table():
     assert names_in("materials") == "mrt_bsdf"
-    assert names_in("lights") == "mrt_light"
+    assert "mrt_light" in names_in("lights").split(", ")
     row = material_rows([mi.load_dict({"type": "sphere"})])
     assert row == "a material other than mrt_bsdf"
 
