@@ -25,7 +25,7 @@ STUDIES = {
     "stock": ("stock", "are light, gloss and mirrors what Mitsuba computes", 15, 60),
     "scenes": ("scenes", "are the report's scenes right, with a reason for each pixel off", 10, 60),
     "filters": ("filters", "do detectors chase noise, is the blur like a lens", 9, 120),
-    "adaptive": ("adaptive", "are own scenes Mitsuba's, and errors cheap", 6, 60),
+    "adaptive": ("adaptive", "what does an error cost next to the best sampler", 90, 1500),
     "honest": ("honest", "is the mean right and the error as stated, calm to wild", 20, 1200),
     "stability": ("stability", "where must float32 give out, and where does it not", 16, 220),
     "error-vs-time": ("error_vs_time", "what does each setting buy for its time", 9, 1500),

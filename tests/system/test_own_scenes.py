@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -142,10 +143,49 @@ def test_size_sensor_and_parameters(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:a few rays rule the error")
-def test_stated_errors_hold_and_means_are_unbiased():
+def test_stated_errors_hold_and_means_are_unbiased(monkeypatch):
+    monkeypatch.setattr(adaptive, "KINDS", ("texture",))
+    monkeypatch.setattr(adaptive, "TIMED", ("spot",))
     for study in (adaptive, honest):
         found = findings(study.run, quick=True)
         assert found.passed, found.missed
+        if study is adaptive:
+            assert [*found.tables] == ["best-96", "aim-96", "ray-96", "equal-error"]
+            for table in ("best-96", "equal-error"):
+                assert found.tables[table]["columns"][:2] == ["scene", "sampler"]
+            assert found.tables["best-96"]["rows"][0][1] in adaptive.SAMPLERS
+            assert 0.9 < found.tables["ray-96"]["rows"][0][1] <= 1
+            assert len(found.goals) == 6
+
+
+@pytest.mark.parametrize("aim", [1.0, 1.3])
+def test_costs_are_compared_at_equal_error_with_the_fastest(monkeypatch, aim):
+    """Of made up pictures: noise of a known size, which takes known seconds."""
+    noise = {"independent": 1.0, "stratified": 0.6, "multijitter": 0.5, "ldsampler": 0.5}
+    dear = {"ldsampler": 1.5}
+
+    def picture(deviation: float, seed: int) -> np.ndarray:
+        return np.random.default_rng(seed).normal(1, deviation, (96, 96, 3))
+
+    def uniform(sampler: str, spp: int, seed: int) -> Any:
+        return picture(noise[sampler] / math.sqrt(spp), 1000 * spp + seed), spp * dear.get(sampler, 1)
+
+    def ours(sampler: str, options: Any, seed: int) -> Any:
+        image = picture(aim * options["target"], seed + 10**6)
+        return SimpleNamespace(image=image, rounds=[SimpleNamespace(spp=30.0)]), 32.0
+
+    monkeypatch.setattr(adaptive, "load_kind", lambda kind, size, sampler="multijitter": sampler)
+    monkeypatch.setattr(adaptive, "uniform", uniform)
+    monkeypatch.setattr(adaptive, "adaptive", ours)
+    cost, reached = adaptive.to_an_error("calm", 96, 64, turns=3, seeds=6)
+    assert cost["sampler"] == "multijitter"
+    assert_allclose(cost["rays"], 30 / 64 * aim**2, rtol=0.05)  # at the error that ours has
+    assert_allclose(cost["time"], 32 / 64 * aim**2, rtol=0.05)
+    assert_allclose([reached[name] for name in ("median", "RMS", "worst")], aim, rtol=0.03)
+    assert reached["above 1.15"] == 6 * (aim > 1.15)
+    assert reached["warned"] == 0
+    study = findings(adaptive.renders_to_an_error, size=96, rays=64, turns=2, seeds=6)
+    assert study.passed == (aim < 1.15)
 
 
 @pytest.mark.parametrize("spp", [16, 40, 100])

@@ -1,4 +1,4 @@
-"""Scenes of one's own: are they what Mitsuba renders, and what does an error cost where rays follow noise?
+"""Rays that follow noise: what an error costs next to the best of Mitsuba's samplers, and is it the target?
 
 ``honest`` says whether the errors stated are true, and means unbiased.
 """
@@ -6,7 +6,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
@@ -14,78 +17,216 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.studies.filters import rmse
-from mrt_mitsuba.validation.tools.scenery import LOCAL, SCENES, SPP, load
-from mrt_mitsuba.validation.tools.study import Study, in_turns, timed
+from mrt_mitsuba.validation.tools.scenery import KINDS, LOCAL, SCENES, load, load_kind
+from mrt_mitsuba.validation.tools.study import Study, in_turns
 
-TITLE = "Scenes of one's own, and the cost of an error"
+TITLE = "The cost of an error, against the best sampler"
+SAMPLERS = ("independent", "stratified", "multijitter", "ldsampler")
+LADDER = (0.5, 1, 2)  # times the rays of multijitter that have the target's error
 QUICK = ("gloss", "stratified", "texture_and_sky")
-DOORS = ("aamode=noise", "target")  # to rays where the noise is
+UNIFORM = 128  # rays a pixel of ``SCENES``
+TIMED = ("calm", "texture", "gloss", "glass", "spot")  # kinds whose rays are timed
+WIDE = 1.15  # of a target: what misses it by more must warn
+
+Timed = tuple[Any, float]  # a picture, or a result, and its seconds
+Row = dict[str, Any]
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Compare pictures, and costs at equal error, given that uniform rays err by the root of their number."""
-    names, size, repeats = (QUICK, (48, 36), 3) if quick else (tuple(SCENES), (192, 144), 5)
-    rows: list[dict[str, Any]] = []
-    for name in study.each("Scenes of one's own", names):
-        same, uniform, *ours = measure(load(name, *size), repeats)
-        what, why = (
-            f"{name}: uniform samples off mi.render's, over their noise",
-            "the same seeds, the same rays",
+    """Compare the time to an error, the error with its target, a ray's time, and pictures with Mitsuba's."""
+    if quick:
+        renders_to_an_error(study, 96, 64, turns=3, seeds=6)
+        rays_alone(study, 96, 64, turns=3)
+        own_scenes(study, QUICK, (48, 36), turns=3)
+        return
+    for size, rays in ((128, 256), (256, 64)):
+        renders_to_an_error(study, size, rays, turns=5, seeds=20)
+        rays_alone(study, size, rays, turns=5)
+    own_scenes(study, tuple(SCENES), (96, 72), turns=5)
+
+
+def uniform(scene: Any, spp: int, seed: int) -> Timed:
+    """The picture of ``mi.render``, and its seconds."""
+    start = time.perf_counter()
+    picture = np.array(mi.render(scene, spp=spp, seed=seed))
+    return picture, time.perf_counter() - start
+
+
+def adaptive(scene: Any, options: Row, seed: int) -> Timed:
+    """The result of ``mrt.render``, and its seconds."""
+    start = time.perf_counter()
+    result = mrt.render(scene, seed=seed, **options)
+    return result, time.perf_counter() - start
+
+
+def pictures(side: Sequence[Timed]) -> list[np.ndarray]:
+    return [np.asarray(getattr(result, "image", result)) for result, _ in side]
+
+
+def seconds(side: Sequence[Timed]) -> np.ndarray:
+    return np.array([seconds for _, seconds in side])
+
+
+def mean_rays(side: Sequence[Timed]) -> float:
+    return float(np.median([result.rounds[-1].spp for result, _ in side]))
+
+
+def goals(study: Study, what: str, rows: Sequence[Row], mean: float, worst: float) -> None:
+    """Hold the "time" of rows, and where it is "from" and "to", to goals."""
+    columns = [[row[name] for row in rows] for name in ("from", "time", "to")]
+    low, middle, high = np.exp(np.mean(np.log(columns), axis=1)).tolist()
+    why = "rays that are saved, each a fifth dearer"
+    study.goal(f"{what}: geometric mean", middle, mean, why, interval=(low, high))
+    slowest = max(rows, key=lambda row: float(row["time"]))
+    interval = slowest["from"], slowest["to"]
+    study.goal(f"{what}: worst, {slowest['scene']}", slowest["time"], worst, why, interval=interval)
+
+
+# ---------------------------------------- Against the best sampler ----------------------------------------
+
+
+def renders_to_an_error(study: Study, size: int, rays: int, *, turns: int, seeds: int) -> None:
+    """Render to the error that ``multijitter`` has after so many rays a pixel."""
+    costs: list[Row] = []
+    aims: list[Row] = []
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)  # samplers that round numbers of rays say so each time
+    try:
+        for kind in study.each(f"Renders to an error, {size}x{size}", KINDS):
+            cost, aim = to_an_error(kind, size, rays, turns, seeds)
+            costs.append(cost)
+            aims.append(aim)
+    finally:
+        mi.set_log_level(level)
+    title = f"Renders to the error of {rays} rays of multijitter, {size}x{size}"
+    note = "Over the sampler that is fastest to the true error of ours; from and to: the middle 80 %."
+    study.records(f"best-{size}", title, costs, note, first=True)
+    note = f"True error over target, {seeds} seeds. Warned: of those above {WIDE}."
+    study.records(f"aim-{size}", f"{title}: the error in the end", aims, note, first=True)
+    mean, worst = (0.45, 1.0) if size > 128 else (0.6, 1.2)
+    goals(study, f"time over the best sampler's to the same error, {size}x{size}", costs, mean, worst)
+    unsaid = max(row[f"above {WIDE}"] - row["warned"] for row in aims)
+    what = f"pictures above {WIDE} of the target without a warning, of {seeds}, {size}x{size}"
+    study.at_most(what, unsaid, max(1, seeds // 10), "an interval of 95 %")
+
+
+def to_an_error(kind: str, size: int, rays: int, turns: int, seeds: int) -> tuple[Row, Row]:
+    """What a render to an error takes, and how near to its target it ends."""
+    scene = load_kind(kind, size)
+    converged = [uniform(scene, 4 * rays, 1000 + k)[0] for k in range(8)]
+    truth = np.asarray(np.mean(converged, axis=0, dtype=np.float64))
+    noise = float(np.var(converged, axis=0, ddof=1).mean()) / len(converged)  # squared error of the truth
+
+    def error(side: Sequence[Timed]) -> float:
+        squares = [rmse(picture, truth) ** 2 for picture in pictures(side)]
+        return math.sqrt(max(float(np.mean(squares)) - noise, 0.01 * noise))
+
+    target = error([uniform(scene, rays, 2000 + k) for k in range(4)])
+    ladder = [round(step * rays) for step in LADDER]
+    sides: list[Callable[[int], Timed]] = [partial(adaptive, scene, {"target": target})]
+    for sampler in SAMPLERS:
+        other = load_kind(kind, size, sampler)
+        sides += [partial(uniform, other, count) for count in ladder]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mrt.MrtWarning)
+        in_turns(sides, 1)  # compiles
+        ours, *theirs = in_turns(sides, turns)
+    ratios: list[float] = []
+    warned: list[bool] = []
+    for seed in range(seeds):
+        with warnings.catch_warnings(record=True) as messages:
+            warnings.simplefilter("always", mrt.MrtWarning)
+            ratios.append(error([sides[0](seed)]) / target)
+        if ratios[-1] > WIDE:
+            warned.append(bool(messages))
+    aim: Row = {"scene": kind, "median": float(np.median(ratios)), "RMS": math.hypot(*ratios) / seeds**0.5}
+    aim |= {"worst": max(ratios), f"above {WIDE}": len(warned), "warned": sum(warned)}
+    reached = target * aim["RMS"]
+    costs: list[Row] = []
+    for k, sampler in enumerate(SAMPLERS):
+        rungs = theirs[k * len(ladder) : (k + 1) * len(ladder)]
+        errors = [error(rung) for rung in rungs]
+        medians = [float(np.median(seconds(rung))) for rung in rungs]
+        there = _at(reached, errors, medians)
+        low, middle, high = (
+            np.quantile(seconds(ours) / seconds(rungs[1]), (0.1, 0.5, 0.9)) * medians[1] / there
         )
-        study.at_most(
-            what, same, 1e-3, f"{why}; a film's filter or a lattice that is not the scene's leaves 1"
-        )
-        limit, why = 1.1, "noise is even: estimating it may cost a tenth"
-        if name in LOCAL:
-            limit, why = 0.6, "noise is local: rays elsewhere are saved"
-        row: dict[str, Any] = {"scene": name, "off by": same}
-        for door, found in zip(DOORS, ours, strict=True):
-            worth = found["squares"] / uniform["squares"]
-            rays = float(np.median(worth * found["rays"])) / SPP
-            low, middle, high = np.quantile(
-                worth * found["seconds"] / uniform["seconds"], (0.1, 0.5, 0.9)
-            ).tolist()
-            figures = {"rays": rays, "seconds": middle, "from": low, "to": high}
-            row |= {f"{door}: {column}": figure for column, figure in figures.items()}
-            what = f"to the same error / mi.render's: {name}, {door}"
-            study.goal(f"time {what}", middle, limit, why, interval=(low, high))
-            study.at_most(f"rays {what}", rays, limit, why)
+        needed = mean_rays(ours) / _at(reached, errors, ladder)
+        cost: Row = {"scene": kind, "sampler": sampler, "its seconds": there, "rays": needed}
+        costs.append(cost | {"a ray": middle / needed, "time": middle, "from": low, "to": high})
+    return min(costs, key=lambda cost: float(cost["its seconds"])), aim
+
+
+def _at(error: float, errors: Sequence[float], figures: Sequence[float]) -> float:
+    """The figure at an error: on a line, as logarithms."""
+    slope, level = np.polyfit(np.log(errors), np.log(figures), 1)
+    return float(np.exp(level + slope * math.log(error)))
+
+
+def rays_alone(study: Study, size: int, rays: int, *, turns: int) -> None:
+    """Trace as many rays as ``multijitter``."""
+    rows: list[Row] = []
+    for kind in study.each(f"Rays, {size}x{size}", TIMED):
+        row: Row = {"scene": kind}
+        for rfilter in ("box", "gaussian"):
+            scene = load_kind(kind, size, rfilter=rfilter)
+            ours = partial(adaptive, scene, {"aamode": "noise", "spp": rays})
+            sides: list[Callable[[int], Timed]] = [ours, partial(uniform, scene, rays)]
+            in_turns(sides, 1)  # compiles
+            first, second = in_turns(sides, turns)
+            spent = mean_rays(first) / rays
+            row[f"{rfilter}: rays"] = spent
+            row[f"{rfilter}: a ray"] = float(np.median(seconds(first) / seconds(second))) / spent
         rows.append(row)
-    title = f"Cost of the error that mi.render has with {SPP} rays a pixel, {size[0]}x{size[1]}"
-    note = f"Over mi.render's, with the middle 80 % of the seconds. Noise is local in {', '.join(LOCAL)}."
+    note = "aamode=noise over multijitter. Where rays go to glass, their paths are longer."
+    study.records(f"ray-{size}", f"{rays} rays a pixel, {size}x{size}", rows, note)
+    costs = [row[f"{rfilter}: a ray"] for row in rows for rfilter in ("box", "gaussian")]
+    what = f"time of a ray over multijitter's, {size}x{size}: worst"
+    study.goal(what, max(costs), 1.2, "rounds and statistics", interval=(min(costs), max(costs)))
+
+
+# ------------------------------------------ Scenes of one's own ------------------------------------------
+
+
+def own_scenes(study: Study, names: Sequence[str], size: tuple[int, int], *, turns: int) -> None:
+    """Compare pictures with Mitsuba's, and costs with those of the samplers that the scenes name."""
+    rows: list[Row] = []
+    for name in study.each("Scenes of one's own", names):
+        row = own_scene(name, size, turns)
+        what = f"{name}: uniform samples off mi.render's, over their noise"
+        why = "the same seeds, the same rays; a film's filter or a lattice that is not the scene's leaves 1"
+        study.at_most(what, row["off by"], 1e-3, why)
+        why = "rays where there is no noise are saved; where it is even, estimating it may cost a tenth"
+        limit = 0.6 if name in LOCAL else 1.1
+        study.at_most(f"rays to the same error / mi.render's: {name}", row["rays"], limit, why)
+        rows.append(row)
+    title = f"Renders to the error of {UNIFORM} rays of the scene's own sampler, {size[0]}x{size[1]}"
+    note = f"Time, from and to: scaled to equal error. Noise is local in {', '.join(LOCAL)}."
     study.records("equal-error", title, rows, note, first=True)
+    what = "time over that of the scene's own sampler"
+    goals(study, f"{what}, scaled to equal error", rows, 0.36, 0.95)
+    mean = float(np.exp(np.mean([math.log(row["as it is"]) for row in rows])))
+    study.goal(f"{what}, as it is: geometric mean", mean, 0.5, "rays that are saved", interval=(mean, mean))
 
 
-def measure(scene: Any, repeats: int) -> tuple[Any, ...]:
-    """Render by ``mi.render``, with ``aamode="noise"``, and to the error of the first, in turns.
+def own_scene(name: str, size: tuple[int, int], turns: int) -> Row:
+    """How far uniform samples are off Mitsuba's, and what their error costs where rays follow noise.
 
-    Return how far our uniform samples are off Mitsuba's, over the noise; then "rays", "seconds" and "squares"
-    of each kind, by picture: the squared error by its distance from the mean of all, which needs no truth.
+    A squared error is the distance from the mean of all turns, which needs no truth.
     """
-
-    def theirs(seed: int) -> tuple[np.ndarray, float]:
-        return np.array(mi.render(scene, spp=SPP, seed=seed)), SPP
-
-    def ours(seed: int, **options: Any) -> tuple[np.ndarray, float]:
-        result = mrt.render(scene, seed=seed, **options)
-        return result.image, result.rounds[-1].spp if result.rounds else SPP
-
-    one, other = theirs(1000)[0], theirs(1001)[0]
+    scene = load(name, *size)
+    one, other = (uniform(scene, UNIFORM, seed)[0] for seed in (1000, 1001))
     error = rmse(one, other) / math.sqrt(2)
-    same = rmse(ours(1000, aa=1, aamode="none", spp=SPP)[0], one) / error
-    kinds: list[Callable[[int], tuple[np.ndarray, float]]] = [
-        theirs,
-        lambda seed: ours(seed, aamode="noise", spp=SPP),
-        lambda seed: ours(seed, target=error),
+    same, _ = adaptive(scene, {"aa": 1, "aamode": "none", "spp": UNIFORM}, 1000)
+    sides: list[Callable[[int], Timed]] = [
+        partial(adaptive, scene, {"target": error}),
+        partial(uniform, scene, UNIFORM),
     ]
-    for kind in kinds:
-        kind(1000)  # compiles
-    found = []
-    sides = [lambda seed, kind=kind: timed(lambda: kind(seed)) for kind in kinds]
-    for side in in_turns(sides, repeats):
-        pictures, rays = zip(*(result for result, _ in side), strict=True)
-        mean = np.asarray(np.mean(pictures, axis=0, dtype=np.float64))
-        squares = [rmse(picture, mean) ** 2 * repeats / (repeats - 1) for picture in pictures]
-        seconds = [seconds for _, seconds in side]
-        found.append({"squares": np.array(squares), "rays": np.array(rays), "seconds": np.array(seconds)})
-    return same, *found
+    in_turns(sides, 1)  # compiles
+    ours, theirs = in_turns(sides, turns)
+    squares = [np.var(pictures(side), axis=0, ddof=1).mean() for side in (ours, theirs)]
+    worth = float(squares[0] / squares[1])
+    low, middle, high = np.quantile(seconds(ours) / seconds(theirs), (0.1, 0.5, 0.9)).tolist()
+    row: Row = {"scene": name, "sampler": scene.sensors()[0].sampler().class_name()}
+    row |= {"off by": rmse(same.image, one) / error, "rays": worth * mean_rays(ours) / UNIFORM}
+    return row | {"as it is": middle, "time": worth * middle, "from": worth * low, "to": worth * high}

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.tools.scenery import sensor
+from mrt_mitsuba.validation.tools.scenery import load_room
 from mrt_mitsuba.validation.tools.study import Study
 
 TITLE = "Errors that can be trusted"
@@ -30,21 +30,13 @@ QUICK = (("matte", "large"), ("glass", "small"))
 
 
 def scene(ball: str, lamp: str) -> Any:
-    """Return a ball on a floor under a lamp and a faint sky."""
-    to, radius = mi.ScalarTransform4f(), LAMPS[lamp]
-    box = {"width": SIZE, "height": SIZE}
+    """A ball on a floor under a lamp and a faint sky."""
+    radius = LAMPS[lamp]
     light = {"type": "area", "radiance": {"type": "rgb", "value": 4 / radius**2}}
-    floor = {"type": "rectangle", "to_world": to.rotate([1, 0, 0], -90).scale(10)}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path"},
-            "sensor": sensor([0, 2, 5], [0, 0.6, 0], "box", film=box),
-            "floor": floor | {"bsdf": {"type": "diffuse"}},
-            "ball": {"type": "sphere", "center": [0, 0.9, 0], "radius": 0.8, "bsdf": BALLS[ball]},
-            "lamp": {"type": "sphere", "center": [1.5, 4, 1], "radius": radius, "emitter": light},
-            "sky": {"type": "constant", "radiance": 0.05},
-        }
+    return load_room(
+        SIZE,
+        ball={"type": "sphere", "center": [0, 0.9, 0], "radius": 0.8, "bsdf": BALLS[ball]},
+        lamp={"type": "sphere", "center": [1.5, 4, 1], "radius": radius, "emitter": light},
     )
 
 

@@ -1,4 +1,4 @@
-"""Parts of the scenes that studies render: cameras, other materials; and ten whole scenes.
+"""Parts of the scenes that studies render: cameras, other materials; ten whole scenes; kinds of noise.
 
 The whole ones use Mitsuba's own lights, lenses, materials, filters and samplers, as users' scenes do.
 """
@@ -255,3 +255,50 @@ def stratified() -> Node:
         box=_box(),
         lamp=_lamp([0, 4, 1], 1.0, 5),
     )
+
+
+# --------------------------------------------- Kinds of noise ----------------------------------------------
+
+
+KINDS = ("calm", "texture", "lights", "gloss", "glass", "spot", "fog")
+
+
+def load_room(size: int, *, sampler: str = "independent", rfilter: str = "box", **others: Node) -> mi.Scene:
+    """A matte ball on a floor under a lamp and a faint sky; ``others`` add nodes or replace these."""
+    film = {"width": size, "height": size}
+    nodes = {
+        "integrator": {"type": "path"},
+        "sensor": sensor([0, 2, 5], [0, 0.6, 0], rfilter, sampler, film=film),
+        "floor": _floor(_diffuse(rgb(0.5))),
+        "ball": _ball([0, 0.9, 0], 0.8, _diffuse(rgb(0.5))),
+        "lamp": _lamp([1.5, 4, 1], 0.8, 6.25),
+        "sky": _sky(0.05),
+    }
+    medium = others.pop("medium", None)
+    if medium is not None:
+        nodes["sensor"]["medium"] = medium
+    return mi.load_dict({"type": "scene"} | nodes | others)
+
+
+def load_kind(kind: str, size: int, sampler: str = "multijitter", rfilter: str = "box") -> mi.Scene:
+    """A room with one of the ``KINDS`` of noise."""
+    others: Node = {"integrator": {"type": "path", "max_depth": 5}}
+    if kind == "texture":
+        others["floor"] = _floor(_diffuse(_checks(100)))
+    elif kind == "lights":
+        places = np.random.default_rng(1).uniform([-3, 1, -3], [3, 3, 3], (30, 3)).tolist()
+        others |= {f"lamp{k}": _lamp(place, 0.05, 40) for k, place in enumerate(places)}
+    elif kind == "gloss":
+        others["floor"] = _floor({"type": "roughconductor", "alpha": 0.1})
+        others["ball"] = _ball([0, 0.9, 0], 0.8, {"type": "roughplastic", "alpha": 0.1})
+    elif kind == "glass":
+        others["ball"] = _ball([0, 0.9, 0], 0.8, {"type": "dielectric"})
+    elif kind == "spot":
+        place = _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])
+        others["lamp"] = {"type": "spot", "intensity": rgb(40), "cutoff_angle": 25, "to_world": place}
+    elif kind == "fog":
+        inside = {"type": "ref", "id": "fog"}
+        others["fog"] = {"type": "homogeneous", "id": "fog", "sigma_t": 0.15, "albedo": 0.8}
+        others["around"] = {"type": "sphere", "radius": 30, "bsdf": {"type": "null"}, "interior": inside}
+        others |= {"integrator": {"type": "volpath", "max_depth": 5}, "medium": inside}
+    return load_room(size, sampler=sampler, rfilter=rfilter, **others)
