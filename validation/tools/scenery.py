@@ -269,8 +269,8 @@ def load_room(size: int, *, sampler: str = "independent", rfilter: str = "box", 
     nodes = {
         "integrator": {"type": "path"},
         "sensor": sensor([0, 2, 5], [0, 0.6, 0], rfilter, sampler, film=film),
-        "floor": _floor(_diffuse(rgb(0.5))),
-        "ball": _ball([0, 0.9, 0], 0.8, _diffuse(rgb(0.5))),
+        "floor": _floor(_diffuse(0.5)),
+        "ball": _ball([0, 0.9, 0], 0.8, _diffuse(0.5)),
         "lamp": _lamp([1.5, 4, 1], 0.8, 6.25),
         "sky": _sky(0.05),
     }
@@ -284,7 +284,7 @@ def load_kind(kind: str, size: int, sampler: str = "multijitter", rfilter: str =
     """A room with one of the ``KINDS`` of noise."""
     others: Node = {"integrator": {"type": "path", "max_depth": 5}}
     if kind == "texture":
-        others["floor"] = _floor(_diffuse(_checks(100)))
+        others["floor"] = _floor(_checks(100))
     elif kind == "lights":
         places = np.random.default_rng(1).uniform([-3, 1, -3], [3, 3, 3], (30, 3)).tolist()
         others |= {f"lamp{k}": _lamp(place, 0.05, 40) for k, place in enumerate(places)}
