@@ -123,10 +123,9 @@ def _read_materials(snapshot: Snapshot) -> tuple[list[np.ndarray], dict[str, Any
     outcome = material_rows(snapshot.shapes)
     unmergeable = outcome if isinstance(outcome, str) else ""
     rows = [] if isinstance(outcome, str) else outcome
-    lobes = []
-    for k, lobe in enumerate(LOBES, start=1):  # materials outside the table may have any
-        present = bool(unmergeable) or any(row[k].any() for row in rows)
-        lobes.append((lobe.name, present))
+    # Kernels leave out lobes by their flags; materials outside the table may have any
+    flags = {lobe.flag for k, lobe in enumerate(LOBES, start=1) if any(row[k].any() for row in rows)}
+    lobes = [(lobe.name, bool(unmergeable) or lobe.flag in flags) for lobe in LOBES]
     mirrors = []
     for bsdf in filter(has_mirror, bsdfs):
         mirrors.append(bsdf.mirror_bound() if is_mrt_bsdf(bsdf) else Mirror(1.0, 1.0))

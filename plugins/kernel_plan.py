@@ -76,7 +76,7 @@ class KernelPlan:
     spheres: str  #: "none", "corrected": hits moved onto them, "table": and no call to the shape
     lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
     mirrors: bool  #: mirror reflections
-    lobes: tuple[str, ...]  #: of the materials: "diffuse", "specular"
+    lobes: tuple[str, ...]  #: of the materials, by name
     #: what multiplies a path's throughput (inf: it never ends for being too dim), and a light's share at a
     #: hit, before they are compared with ``min_contribution``
     cut_off: tuple[float, float]

@@ -11,7 +11,9 @@ import pytest
 from nodes import example, sensor
 
 from mrt_mitsuba import plugins
+from mrt_mitsuba.plugins import facts
 from mrt_mitsuba.plugins.lobes import LOBES, Lobes, Pair, material_rows
+from mrt_mitsuba.plugins.snapshot import Kept, Snapshot
 from mrt_mitsuba.plugins.table import PLUGINS, names_in
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -97,6 +99,22 @@ def test_lobes_may_share_a_flag(monkeypatch):
     )
     pair = Pair.above(mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Bool(True))
     assert np.ravel(at.value(context, pair))[0] == pytest.approx(0.5 / np.pi + 0.25)  # float32
+
+
+def test_a_lobe_is_left_out_only_with_all_of_its_flag(monkeypatch):
+    """Kernels leave lobes out by their flags: the plan said that one was left out, which was evaluated."""
+
+    class Sheen:
+        name = "sheen"
+        flag = "DiffuseReflection"
+
+    matte = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": matte}})
+    rows = [np.vstack([row, np.zeros_like(row[:1])]) for row in material_rows(scene.shapes())]
+    monkeypatch.setattr(facts, "LOBES", (*LOBES, Sheen()))
+    monkeypatch.setattr(facts, "material_rows", lambda shapes: rows)
+    found = facts.Reading(Snapshot(scene, None), Kept()).facts.lobes
+    assert found == (("diffuse", True), ("specular", False), ("sheen", True))
 
 
 def test_derivatives_by_shapes_warn_once(capfd):
