@@ -147,14 +147,14 @@ def change(where: str, *, what: str, why: str) -> Callable[[Function], Function]
 # ------------------------------------------- Rendering in turn -----------------------------------------
 
 
-def is_ours(thing: object) -> bool:
+def of_this_package(thing: object) -> bool:
     """Return whether this package has the class of an object."""
     return type(thing).__module__.startswith("mrt_mitsuba.")
 
 
 def needs_turn(scene: mi.Scene, integrator: mi.Integrator) -> bool:
     """Return whether a render runs Python code of ours, and none of somebody else's that may wait for it."""
-    if is_ours(integrator):
+    if of_this_package(integrator):
         return True
     if not plugins.any_constructed() or not plugins.is_known(integrator):
         return False
@@ -162,7 +162,7 @@ def needs_turn(scene: mi.Scene, integrator: mi.Integrator) -> bool:
     materials = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in shapes)}
     direct = (*scene.emitters(), *shapes, *materials.values(), *scene.sensors())
     # A texture, say, in a material of Mitsuba's
-    return any(map(is_ours, direct)) or any(map(is_ours, mi.traverse(scene).hierarchy))
+    return any(map(of_this_package, direct)) or any(map(of_this_package, mi.traverse(scene).hierarchy))
 
 
 @change(

@@ -15,6 +15,7 @@ from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.validation.studies import error_vs_time, needs
 from mrt_mitsuba.validation.studies.stability import curves
 from mrt_mitsuba.validation.tools import diagrams
+from mrt_mitsuba.validation.tools.compare import averaged
 from mrt_mitsuba.validation.tools.originals import read_original
 from mrt_mitsuba.validation.tools.study import Study, findings
 from mrt_mitsuba.validation.tools.work_precision import Findings
@@ -120,10 +121,10 @@ def tenths(scene: Any, *, seeds: int, truth_spp: int, **options: Any) -> tuple[n
     """
     chosen = mi.load_dict({"type": options["integrator"]})
     parts = [
-        np.array(mi.render(scene, integrator=chosen, spp=truth_spp // 8, seed=1000 + k)) for k in range(8)
+        np.array(mi.render(scene, integrator=chosen, spp=truth_spp // 8, seed=1000 + k))[..., :3]
+        for k in range(8)
     ]
-    truth = np.asarray(np.mean(parts, axis=0, dtype=np.float64))[..., :3]
-    noise = np.asarray(np.var(parts, axis=0, ddof=1))[..., :3].mean(axis=-1) / len(parts)
+    truth, noise = averaged(parts)
     stated = []
     true = []
     for seed in range(seeds):

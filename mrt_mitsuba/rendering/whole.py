@@ -10,7 +10,7 @@ from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.filters.grid import window_means
 from mrt_mitsuba.output.error import tail_shape
 from mrt_mitsuba.rendering.exposing import Exposer
-from mrt_mitsuba.rendering.noise import HALVES, SCOUTS, Halves, quarter_squares
+from mrt_mitsuba.rendering.noise import HALVES, LUMINANCE, SCOUTS, Halves, quarter_squares
 
 _STRIDE = 0x9E3779B9  # from one seed to the next: the golden ratio in 32 bits
 
@@ -39,7 +39,7 @@ def whole_pictures(
         weight = raw[..., place]
         found = np.delete(raw, place, -1) / np.where(weight == 0, 1, weight)[..., None]
         if film.grey:
-            found[..., :3] = (found[..., :3] @ [0.212671, 0.715160, 0.072169])[..., None]
+            found[..., :3] = (found[..., :3] @ LUMINANCE)[..., None]
         yield count, found
         seed = (seed + _STRIDE) % 2**32
         advance(count * film.pixels)

@@ -17,6 +17,7 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.studies.filters import rmse
+from mrt_mitsuba.validation.tools.compare import averaged
 from mrt_mitsuba.validation.tools.scenery import KINDS, LOCAL, SCENES, load, load_kind
 from mrt_mitsuba.validation.tools.study import Study, in_turns
 
@@ -114,8 +115,8 @@ def to_an_error(kind: str, size: int, rays: int, turns: int, seeds: int) -> tupl
     """What a render to an error takes, and how near to its target it ends."""
     scene = load_kind(kind, size)
     converged = [uniform(scene, 4 * rays, 1000 + k)[0] for k in range(8)]
-    truth = np.asarray(np.mean(converged, axis=0, dtype=np.float64))
-    noise = float(np.var(converged, axis=0, ddof=1).mean()) / len(converged)  # squared error of the truth
+    truth, spread = averaged(converged)
+    noise = float(spread.mean())
 
     def error(side: Sequence[Timed]) -> float:
         squares = [rmse(picture, truth) ** 2 for picture in pictures(side)]

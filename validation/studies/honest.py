@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.validation.tools.compare import averaged
 from mrt_mitsuba.validation.tools.scenery import load_room
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -81,9 +82,8 @@ def run(study: Study, *, quick: bool) -> None:
 def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
     once = truth_rays // 16
     pictures = [np.array(mi.render(scene, spp=once, seed=10_000 + k)) for k in range(16)]
-    truth = np.mean(pictures, axis=0, dtype=np.float64)
+    truth, noise = averaged(pictures)
     own = np.std([p.mean() for p in pictures], ddof=1) / len(pictures) ** 0.5  # of its mean
-    noise = np.var(pictures, axis=0, ddof=1).mean(-1) / len(pictures)  # squared error of the truth
     rounding = (1e-4 * truth.mean()) ** 2  # of many rays of one value, in single precision
     target = float(np.sqrt(noise.mean() * truth_rays / SPP))
     held, doubted, means, stated, true, p = 0, 0, [], [], [], []

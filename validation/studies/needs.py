@@ -17,7 +17,7 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.output import LAYERS
-from mrt_mitsuba.plugins.kernel_plan import KernelPlan
+from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rendering.api import Result
 from mrt_mitsuba.validation.tools import diagrams
 from mrt_mitsuba.validation.tools.study import Study, Values, in_turns, operations
@@ -45,12 +45,12 @@ REFINED: Values = {"aa": 4, "aamode": "sobel", "lattice": "report"}
 Figures = dict[str, dict[str, float]]  # of ``MEASURES``, by the way
 
 
-def general(plan: KernelPlan) -> KernelPlan:
+def general(plan: KernelPlan, facts: SceneFacts) -> KernelPlan:
     """A plan that leaves out no code that a kernel may hold."""
     return replace(
         plan,
         mirrors=True,
-        lobes=("diffuse", "specular"),
+        lobes=tuple(name for name, _ in facts.lobes),
         bvh=True,
         textures=True,
         shading_frames=True,
@@ -67,7 +67,8 @@ def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
     planned = mi.load_dict(nodes)
     whole = mi.load_dict(nodes)
     integrator = whole.integrator()
-    kernels = general(integrator.prepare(whole).plan)
+    data = integrator.prepare(whole)
+    kernels = general(data.plan, data.facts)
     integrator.kernel_plan = lambda facts: kernels
     return planned, whole
 

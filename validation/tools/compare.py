@@ -283,6 +283,13 @@ def p_values(ours: ArrayLike, theirs: ArrayLike, *, tile: int = 16) -> dict[str,
     return found
 
 
+def averaged(pictures: ArrayLike) -> tuple[Array, Array]:
+    """The mean of independent pictures [H, W, channels], in float64, and its squared error [H, W]."""
+    pictures = np.asarray(pictures)
+    mean = pictures.mean(axis=0, dtype=np.float64)
+    return np.asarray(mean), pictures.var(axis=0, ddof=1).mean(axis=-1) / len(pictures)
+
+
 def sidak(p: float, count: int) -> float:
     """The probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
     return 1.0 if p >= 1 else float(-np.expm1(count * np.log1p(-p)))
