@@ -12,6 +12,7 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.output.files import to_8bit
+from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.studies import error_vs_time, needs
 from mrt_mitsuba.validation.studies.stability import curves
 from mrt_mitsuba.validation.tools import diagrams
@@ -27,6 +28,7 @@ Rows = list[dict[str, Any]]
 Drawn = tuple[list["Figure"], Rows]  # and the rows of its table
 
 SMALL = (160, 120)
+MAPS = {"error.Y": "stated error of each pixel", "samples.Y": "rays of each pixel"}  # titles by layer
 
 
 def error_against_time(*scenes: error_vs_time.Number, quick: bool = False) -> Drawn:
@@ -65,7 +67,7 @@ def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
     rows: Rows = []
     for scene, row in enumerate(plots):
         original = read_original(Path(folder) / f"s{scene}_none_aa4.exr")
-        result = mrt.render(original.scene, fresnel="dielectric", **original.options)
+        result = mrt.render(original.scene, fresnel="dielectric", progress=Progress(), **original.options)
         ours = original.like(result.image)
         difference = np.abs(ours - original.image)
         for axes, picture in zip(row, (original.image, ours, 100 * difference), strict=True):
@@ -80,38 +82,36 @@ def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
     return [drawn], rows
 
 
-def show_picture(axes: Any, picture: np.ndarray) -> None:
-    """Show a linear picture [H, W, 3] as the report writes it."""
-    axes.imshow(to_8bit(np.ascontiguousarray(picture, np.float32), "report"), interpolation="nearest")
+def show_picture(axes: Any, picture: np.ndarray, tonemap: str = "report") -> None:
+    """Show a linear picture [H, W, 3], by default as the report writes it."""
+    axes.imshow(to_8bit(np.ascontiguousarray(picture, np.float32), tonemap), interpolation="nearest")
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
 
 
-def maps(result: mrt.Result) -> Figure:
-    """The picture of a render in rounds, its stated error and its rays, pixel by pixel."""
+def maps(result: mrt.Result) -> list[Figure]:
+    """The stated error of each pixel, and its rays, of a render in rounds."""
+    height, width = result.image.shape[:2]
+    figures = []
+    for layer, title in MAPS.items():
+        drawn, axes = diagrams.panel(title, 4.6, 4.6 * height / width + 0.8)
+        show_map(axes, result.layers[layer])
+        figures.append(drawn)
+    return figures
+
+
+def show_map(axes: Any, values: np.ndarray) -> None:
+    """Show positive values [H, W] in colours, on a scale of logarithms."""
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import LogLocator
-    from PIL import Image
 
-    height, width = result.image.shape[:2]
-    drawn, plots = diagrams.figure(1, 3, 14, 14 / 3 * height / width + 0.8)
-    picture, *others = plots[0]
-    picture.imshow(Image.fromarray(to_8bit(result.image, "srgb")))
-    titles = {"error.Y": "stated error of each pixel", "samples.Y": "rays of each pixel"}
-    for axes, (name, title) in zip(others, titles.items(), strict=True):
-        values = result.layers[name]
-        least, most = np.quantile(values[values > 0], (0.01, 1))
-        colors = {"cmap": "viridis", "norm": LogNorm(least, most)}
-        shown = axes.imshow(np.maximum(values, least), **colors)
-        ticks: Any = {"ticks": LogLocator(subs=(1, 2, 5)), "format": "%g"}
-        drawn.colorbar(shown, ax=axes, location="bottom", fraction=0.05, pad=0.02, **ticks).minorticks_off()
-        axes.set_title(title, loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
-    picture.set_title("the picture", loc="left", fontsize=diagrams.LABELS + 2, color=diagrams.TEXT)
-    for axes in plots[0]:
-        axes.set_anchor("N")
-        axes.set(xticks=[], yticks=[])
-        axes.spines[:].set_visible(False)
-    return drawn
+    least, most = np.quantile(values[values > 0], (0.01, 1))
+    shown = axes.imshow(np.maximum(values, least), cmap="viridis", norm=LogNorm(least, most))
+    ticks: Any = {"ticks": LogLocator(subs=(1, 2, 5)), "format": "%g"}
+    bar = axes.figure.colorbar(shown, ax=axes, location="bottom", fraction=0.05, pad=0.02, **ticks)
+    bar.minorticks_off()
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
 
 
 def tenths(scene: Any, *, seeds: int, truth_spp: int, **options: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -128,7 +128,7 @@ def tenths(scene: Any, *, seeds: int, truth_spp: int, **options: Any) -> tuple[n
     stated = []
     true = []
     for seed in range(seeds):
-        result = mrt.render(scene, seed=seed, **options)
+        result = mrt.render(scene, seed=seed, progress=Progress(), **options)
         stated.append(np.square(result.layers["error.Y"]))
         true.append(np.square(result.image - truth).mean(axis=-1) - noise)
     order = np.array_split(np.argsort(stated, axis=None), 10)
@@ -147,8 +147,7 @@ def stated_and_true(
     """
     given = {"integrator": "path", "aamode": "noise", "spp": 64, **options}
     found = {n: tenths(s, seeds=seeds, truth_spp=truth_spp, **given) for n, s in scenes.items()}
-    drawn, plots = diagrams.figure(1, 1, 6.6, 5)
-    axes = plots[0, 0]
+    drawn, axes = diagrams.panel("tenths of the pixels, sorted by stated error", 4.6, 4.0)
     ends = {}
     for (name, (stated, true)), color in zip(found.items(), diagrams.COLORS, strict=False):
         axes.plot(stated, true, marker="o", markersize=4, color=color)
@@ -161,6 +160,6 @@ def stated_and_true(
     for scale in (axes.xaxis, axes.yaxis):
         diagrams.plain_numbers(scale)
     note = {"fontsize": diagrams.LABELS, "color": diagrams.GREY, "transform": axes.transAxes, "va": "top"}
-    axes.text(0.03, 0.97, "tenths of the pixels, sorted by stated error\ngrey: within a factor of 3", **note)
+    axes.text(0.03, 0.97, "grey: within a factor of 3", **note)
     diagrams.label_ends(axes, ends)
     return drawn

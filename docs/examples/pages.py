@@ -1,9 +1,12 @@
-"""What pages of the documentation share: pictures next to each other."""
+"""What pages of the documentation share: pictures, plots and tables."""
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
@@ -11,8 +14,17 @@ from PIL import Image
 from mrt_mitsuba.output import to_8bit
 from mrt_mitsuba.rendering.progress import Progress
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 #: Options of a picture on a page, without bars of progress
 SIZE = {"width": 400, "height": 300, "progress": Progress()}
+
+#: Where pictures of the original program are
+ORIGINALS = Path(__file__).parents[2] / "tests" / "regression" / "data"
+
+#: Whether the plots of answers are made from few renders, as tests do
+QUICK = False
 
 
 def show(*pictures: np.ndarray, columns: int = 3) -> Image.Image:
@@ -36,6 +48,27 @@ def enlarged(image: np.ndarray, x: float, y: float) -> np.ndarray:
     return (
         part[: height // 5, : width // 5].repeat(5, axis=0).repeat(5, axis=1)
     )
+
+
+class Html(str):
+    """Text that a page shows as HTML."""
+
+    def _repr_html_(self) -> str:
+        return str(self)
+
+
+def plots(*figures: Figure, width: str = "18rem") -> Html:
+    """Plots next to each other, as many as there is room for."""
+    images = []
+    for figure in figures:
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=160, facecolor="white")
+        data = base64.b64encode(file.getvalue()).decode()
+        name = figure.axes[0].get_title(loc="left")
+        url = f"data:image/png;base64,{data}"
+        images.append(f'<img alt="{name}" src="{url}">')
+    style = f"--plot: {width}"
+    return Html(f'<div class="plots" style="{style}">{"".join(images)}</div>')
 
 
 class Markdown(str):

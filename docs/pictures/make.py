@@ -8,15 +8,37 @@ from __future__ import annotations
 import argparse
 import io
 import tempfile
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import chromium  # next to this file
+import numpy as np
 import rooms
 from PIL import Image
 
 import mrt_mitsuba as mrt  # first: it chooses the LLVM library
 
+# isort: split
+import mitsuba as mi
+
+from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.validation import figures
+from mrt_mitsuba.validation.tools import diagrams
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 HERE = Path(__file__).parent
+
+
+# Leaves of a check's page the law of weights, and the bounds that do not hold
+CROP = """() => {
+  for (const row of document.querySelectorAll("table.data tbody tr"))
+    row.hidden = row.cells[0].innerText !== "weights";
+  for (const row of document.querySelectorAll("table.bounds tbody tr"))
+    row.hidden = !row.querySelector(".bad");
+}"""
 
 
 def scene3(quick: bool) -> Image.Image:
@@ -39,11 +61,64 @@ def check(quick: bool) -> Image.Image:
     ):
         found.save(folder)
         browser = chromium.launch(playwright)
-        page = browser.new_page(viewport={"width": 1000, "height": 900})
+        page = browser.new_page(viewport={"width": 1180, "height": 700})
         page.goto(f"file://{folder}/index.html")
-        shot = page.screenshot(clip={"x": 0, "y": 130, "width": 1000, "height": 420})
+        page.evaluate(CROP)
+        top = page.locator("section").bounding_box()["y"] + 10
+        shot = page.screenshot(full_page=True, clip={"x": 0, "y": top, "width": 1180, "height": 560})
         browser.close()
     return Image.open(io.BytesIO(shot)).convert("RGB")
+
+
+def equal_time(quick: bool) -> Image.Image:
+    """Mitsuba's Cornell box by ``mi.render`` and by ours in the same time, with our stated error and rays."""
+    mrt.register()
+    box = mi.cornell_box()
+    box["sensor"]["film"] |= {"width": 192, "height": 192}
+    scene = mi.load_dict(box)
+    truth_spp = 64 if quick else 4096
+
+    def theirs(spp: int, seed: int) -> tuple[np.ndarray, float]:
+        start = time.perf_counter()
+        image = np.array(mi.render(scene, spp=spp, seed=seed))
+        return image, time.perf_counter() - start
+
+    def ours() -> tuple[mrt.Result, float]:
+        options = {"integrator": "path", "aamode": "noise", "spp": 24, "progress": Progress()}
+        start = time.perf_counter()
+        return mrt.render(scene, **options), time.perf_counter() - start
+
+    ours()  # compiles its kernels
+    theirs(24, 0)
+    result, seconds = ours()
+    spp = 24
+    for seed in range(4):  # the same time
+        image, took = theirs(spp, seed)
+        spp = max(round(spp * seconds / took), 1)
+    truth = np.mean([theirs(truth_spp // 8, 100 + k)[0] for k in range(8)], axis=0)
+    drawn, plots = diagrams.figure(1, 4, 10.4, 3.3)
+    for axes, name, picture in zip(plots[0], ("mi.render", "ours"), (image, result.image), strict=False):
+        figures.show_picture(axes, picture, "srgb")
+        rmse = np.sqrt(np.square(picture - truth).mean())
+        axes.set_title(f"{name}: {seconds:.2f} s, error {rmse:.3f}", loc="left", **diagrams.WORDS)
+    for axes, title, layer in zip(plots[0, 2:], figures.MAPS.values(), figures.MAPS, strict=True):
+        figures.show_map(axes, result.layers[layer])
+        axes.set_title(title, loc="left", **diagrams.WORDS)
+    return rasterized(drawn)
+
+
+def error_against_time(quick: bool) -> Image.Image:
+    """What an error costs in time in scene 3 by the report's rays, and in the Cornell box by paths."""
+    drawn, _ = figures.error_against_time(3, "Cornell box", quick=quick)
+    panels = [np.asarray(rasterized(figure)) for figure in drawn[:1] + drawn[-1:]]
+    return Image.fromarray(np.hstack(panels))
+
+
+def rasterized(figure: Figure) -> Image.Image:
+    """A figure as pixels."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=120, facecolor="white")
+    return Image.open(file).convert("RGB")
 
 
 def save_rooms(folder: Path) -> Path:
@@ -53,7 +128,12 @@ def save_rooms(folder: Path) -> Path:
     return path
 
 
-PICTURES = {"scene3": scene3, "check": check}
+PICTURES = {
+    "scene3": scene3,
+    "equal_time": equal_time,
+    "check": check,
+    "error_against_time": error_against_time,
+}
 
 
 def save(image: Image.Image, path: Path) -> None:

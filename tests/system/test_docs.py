@@ -25,10 +25,12 @@ def blocks(path: Path, language: str) -> list[str]:
     return re.findall(rf"```{re.escape(language)}\n(.*?)```", path.read_text(), flags=re.DOTALL)
 
 
-# Before the code of a page: its pictures at a smaller size
-PREPARED = """
+# Before the code of a page: its pictures at a smaller size, its plots of few renders
+PREPARED = f"""
 import pages
+pages.ORIGINALS = {str(DOCS.parent / "tests" / "regression" / "data")!r}
 pages.SIZE.update(width=80, height=60)
+pages.QUICK = True
 """
 
 

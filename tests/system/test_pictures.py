@@ -11,7 +11,12 @@ from PIL import Image
 pytest.importorskip("matplotlib")
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
 MOST = 1_000_000  # bytes of all pictures, which every clone loads
-NAMES = ("scene3.png", pytest.param("check.png", marks=pytest.mark.browser))
+NAMES = (
+    "scene3.png",
+    "equal_time.png",
+    "error_against_time.png",
+    pytest.param("check.png", marks=pytest.mark.browser),
+)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -29,5 +34,5 @@ def test_the_drawing_is_as_written(run_command, tmp_path):
 
 def test_pictures_are_those_and_small():
     committed = {path.name for path in FOLDER.iterdir() if path.suffix in (".png", ".svg")}
-    assert committed == {"scene3.png", "check.png", "rooms.svg"}
+    assert committed == {"scene3.png", "equal_time.png", "error_against_time.png", "check.png", "rooms.svg"}
     assert sum((FOLDER / name).stat().st_size for name in committed) <= MOST

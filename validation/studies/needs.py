@@ -19,6 +19,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.output import LAYERS
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rendering.api import Result
+from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.tools import diagrams
 from mrt_mitsuba.validation.tools.study import Study, Values, in_turns, operations
 
@@ -40,7 +41,7 @@ TITLES = {
     "seconds": "time",
 }
 
-REFINED: Values = {"aa": 4, "aamode": "sobel", "lattice": "report"}
+REFINED: Values = {"progress": Progress(), "aa": 4, "aamode": "sobel", "lattice": "report"}
 
 Figures = dict[str, dict[str, float]]  # of ``MEASURES``, by the way
 

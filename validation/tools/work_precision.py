@@ -324,7 +324,14 @@ def _runner(scene: Given, shared: Options) -> Run:
     loaded = {}  # by the id of what a scene is loaded from, which the caller holds
 
     def run(options: Options, seed: int) -> Result:
-        given = {"scene": scene, "variant": variant, **shared, **options, "seed": seed}
+        given = {
+            "scene": scene,
+            "variant": variant,
+            "progress": Progress(),
+            **shared,
+            **options,
+            "seed": seed,
+        }
         one = given.pop("scene")
         loadable = isinstance(one, dict) or str(one).lower().endswith(".xml")
         if loadable and given["variant"] == variant and "params" not in given:
