@@ -159,7 +159,12 @@ def stated_and_true(
     axes.set(xscale="log", yscale="log", xlim=span, ylim=span, xlabel="stated error", ylabel="true error")
     for scale in (axes.xaxis, axes.yaxis):
         diagrams.plain_numbers(scale)
-    note = {"fontsize": diagrams.LABELS, "color": diagrams.GREY, "transform": axes.transAxes, "va": "top"}
+    note: dict[str, Any] = {
+        "fontsize": diagrams.LABELS,
+        "color": diagrams.GREY,
+        "transform": axes.transAxes,
+        "va": "top",
+    }
     axes.text(0.03, 0.97, "grey: within a factor of 3", **note)
     diagrams.label_ends(axes, ends)
     return drawn

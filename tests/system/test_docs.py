@@ -38,7 +38,7 @@ def code(path: Path) -> str:
     """All Python of a page, cells that are run and what is only shown, made quick."""
     text = "\n".join(blocks(path, "{code-cell}") + blocks(path, "python"))
     text = re.sub(r"^:tags:.*$", "", text, flags=re.MULTILINE)
-    return PREPARED + text if "from pages import" in text else text
+    return PREPARED + text if re.search("from pages import|import answers", text) else text
 
 
 @pytest.fixture
