@@ -1,0 +1,146 @@
+"""The error that a render estimates of its own picture: is it right where the noise is known?"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.output.error import tail_shape
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def noise(mean: float = 0.5, rare: float = 0.0) -> Any:
+    """An integrator that sees noise of a known variance, ``mean``² / 3, that no sequence can make less.
+
+    ``rare``: the share of rays that meet 200 in addition.
+    """
+
+    class Noise(mi.SamplingIntegrator):
+        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
+            first, second = (_low_digits(sampler.next_1d()) for _ in range(2))
+            bright = dr.select(second < rare, mi.Float(200), 0)
+            return mi.Spectrum(2 * mean * first + bright), mi.Bool(True), []
+
+        def to_string(self) -> str:
+            return "Noise[]"
+
+    return Noise(mi.Properties())
+
+
+def _low_digits(number: mi.Float) -> mi.Float:
+    """A number in [0, 1) made of the digits that no stratum decides."""
+    scaled = number * 2.0**12
+    return scaled - dr.floor(scaled)
+
+
+def camera(width: int, height: int, rfilter: str = "box") -> mi.Scene:
+    """A scene of nothing but a camera."""
+    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": rfilter}}
+    return mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film}})
+
+
+def _rmse(image: np.ndarray, truth: Any) -> float:
+    return math.sqrt(np.mean(np.square(image - truth, dtype=np.float64)))
+
+
+@pytest.mark.parametrize("share", [0.9, 0.75, 0.6])
+def test_a_target_takes_as_many_rays_as_independent_noise_needs(share):
+    """In a picture so large that its first eight rays a pixel are enough to judge by.
+
+    Targets are aimed at 5 % lower, and 30,000 squares tell an RMSE to half a percent. A variance of two rays
+    that is divided by two, not by one, asks for two thirds more rays, and gets to 0.74 of the target.
+    """
+    target = share * math.sqrt(1 / 12 / 4)  # half of the rays of each half picture's mean
+    result = mrt.render(camera(208, 152), integrator=noise(), target=target, seed=1)
+    assert len(result.rounds) == 2
+    assert 0.9 < _rmse(result.image, 0.5) / target < 1.03
+    assert 0.9 < result.error.rmse / target < 1.03
+
+
+def test_intervals_of_four_pixels_hold_as_often_as_they_say():
+    """The upper end is exceeded by a fortieth or less: with a chance of 0.3 %, so in 400 renders by more than
+    eight once in 10⁵ sets of seeds. Without its widening, by 4.8 %: by so few, once in a hundred."""
+    scene = camera(2, 2)
+    integrator = noise()
+    errors = []
+    for seed in range(400):
+        result = mrt.render(scene, integrator=integrator, aamode="noise", spp=16, seed=seed)
+        errors.append((_rmse(result.image, 0.5), result.error.low, result.error.rmse, result.error.high))
+    true, low, rmse, high = np.transpose(errors)
+    assert np.sum(true > high) <= 8
+    assert np.sum(true < low) <= 40  # 4.7 %: 19 and five deviations
+    assert np.sqrt(np.mean(rmse**2)) == pytest.approx(np.sqrt(np.mean(true**2)), rel=0.1)
+
+
+def test_intervals_reach_farther_up_the_fewer_squares_there_are():
+    ratios = []
+    for side in (2, 8, 64):
+        error = mrt.render(camera(side, side), integrator=noise(), aamode="noise", spp=16, seed=2).error
+        ratios.append(math.log(error.high / error.rmse) / math.log(error.rmse / error.low))
+    assert ratios[0] > 1.5
+    assert ratios[0] > ratios[1] > ratios[2]
+    assert ratios[2] == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("rare", [0.0, 0.004, 0.02])
+@pytest.mark.parametrize("rfilter", ["gaussian", "tent"])
+@pytest.mark.filterwarnings("ignore:a few rays rule the error")
+def test_once_a_half_has_decided_for_the_other_nothing_is_traced(rare, rfilter):
+    """Both halves get the same rays until the last round, in which the values of each decide for the other;
+    a round after that would let them decide for themselves.
+
+    So rays of a pixel grow by multiples of four until then, since they go in pairs, and both scouts get the
+    same, too. Under a filter, more than a twentieth of the rays are left over here, and stay so.
+    """
+    grown = []
+    before = np.zeros((32, 48))
+
+    def compare(now: Any) -> None:
+        grown.append(now.samples - before)
+        before[:] = now.samples
+
+    scene = camera(48, 32, rfilter)
+    result = mrt.render(scene, integrator=noise(rare=rare), aamode="noise", spp=16, on_round=compare)
+    assert len(result.rounds) == len(grown) > 1
+    assert not any((more % 4).any() for more in grown[:-1])
+    assert (grown[-1] % 4).any()
+    assert result.rounds[-1].spp < 16 / 1.05
+
+
+def _tail(count: int = 4000) -> tuple[np.ndarray, int]:
+    """Values of a Pareto law, the largest first, and how many make up half of their squares."""
+    values = ((np.arange(count) + 0.5) / count) ** -0.52
+    squares = np.cumsum(values**2)
+    return values, int(np.searchsorted(squares, squares[-1] / 2)) + 1
+
+
+def test_the_shape_of_a_tail_is_that_of_twice_as_many_values_as_make_up_half_of_the_squares():
+    """A value among them that changes a little changes the shape, and none after them does."""
+    values, half = _tail()
+    assert 13 < half <= 25  # so that neither fewer values nor a mixture are at issue
+    shape = tail_shape(values, np.ones_like(values))
+    for place in range(0, 3 * half):
+        changed = values.copy()
+        changed[place] -= 0.01 * (values[place] - values[place + 1])
+        other = tail_shape(changed, np.ones_like(values))
+        assert (other != shape) == (place <= 2 * half), place
+
+
+def test_whole_pictures_state_their_error():
+    """Light tracing has no rays of pixels: pictures with seeds of their own tell its error."""
+    box = mi.cornell_box()
+    box["sensor"]["film"] |= {"width": 24, "height": 24}
+    scene = mi.load_dict(box)
+    truth = mrt.render(scene, integrator="ptracer", aamode="none", spp=2**13, seed=1).image
+    ratios = []
+    for seed in range(5):
+        result = mrt.render(scene, integrator="ptracer", aamode="noise", spp=64, seed=seed)
+        ratios.append(result.error.rmse / _rmse(result.image, truth))
+    assert 0.6 < np.median(ratios) < 1.6
