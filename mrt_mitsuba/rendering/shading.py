@@ -155,6 +155,9 @@ class Shader:
             # Mitsuba would crash in a sample of stokes, also inside another
             self.layers = frozenset()
         self.aovs = tuple(integrator.aov_names())  #: names of the integrator's own channels
+        twice = sorted({name for name in self.aovs if self.aovs.count(name) > 1})
+        if twice:
+            raise SceneError(f"the integrator has several channels named {twice[0]}; name each differently")
 
     def shift(self, time: mi.Float) -> mi.Vector3f:
         """Return the shift of the camera at a time."""

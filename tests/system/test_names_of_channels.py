@@ -85,6 +85,15 @@ def test_channels_of_aov_keep_their_values(name, options):
     assert albedo.min() == pytest.approx(0, abs=1e-5)
 
 
+@pytest.mark.parametrize("options", [{}, *OPTIONS], ids=str)
+@pytest.mark.parametrize("aovs", ["d:depth,d:depth", "d:albedo,d:albedo"])
+def test_channels_of_one_name_are_refused(aovs, options):
+    """One of the two was lost."""
+    inner = {"type": "aov", "aovs": aovs, "inner": {"type": "path"}}
+    with pytest.raises(mrt.MrtError, match=r"several channels named d\.[TRX]; name each differently"):
+        mrt.render(scene(inner), **options)
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb", "scalar_spectral"], indirect=True)
 @pytest.mark.parametrize("name", ["error", "samples", "d"])
 def test_mrt_adaptive_around_aov(variant, name):
