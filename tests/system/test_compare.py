@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+import sys
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -252,3 +254,11 @@ def test_p_values_are_welchs_of_sums_of_cells():
 def test_wrong_renders_are_named(wrong, message):
     with pytest.raises(mrt.UsageError, match=message):
         p_values(wrong, np.ones((2, *SHAPE)))
+
+
+def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # as if it were not installed
+    picture = np.zeros((4, 4, 3), np.float32)
+    with pytest.raises(mrt.MrtError, match=r"matplotlib is not installed: pip install 'mrt-mitsuba\[validation\]'"):
+        mrt.compare(picture + 1, picture).save(tmp_path / "a.png")
+    assert not list(tmp_path.iterdir())

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mrt_mitsuba.errors import OutputError, UsageError
+from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
 from mrt_mitsuba.output.error import exceedance
 from mrt_mitsuba.output.files import read_channels, write_exr, write_png
 from mrt_mitsuba.output.replacing import check_target
@@ -71,6 +71,7 @@ class Difference:
         """All measures by name."""
         return {name: getattr(self, name) for name in MEASURES}
 
+    @needs_extra()
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the signed difference as .exr, and its size in false colours as .png, black for none.
 
