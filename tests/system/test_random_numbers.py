@@ -47,6 +47,8 @@ passes({**REFINED, **REPORT, **MOVING}, name="lattice, refined frame by frame")
 passes({**REFINED, "spp": 2}, name="film, refined")
 passes({"aamode": "none", "aa": 1, "spp": 3, **MOVING, "motionmode": "stratified"}, name="moments")
 passes({"aamode": "noise", "spp": 32}, name="rounds")
+passes({"aamode": "none", "aa": 1, "spp": 4, "sampler": "stratified"}, name="film, strata")
+passes({**REFINED, "spp": 4, "sampler": "multijitter"}, name="film, refined, jitter")
 
 
 @pytest.mark.parametrize("at_once", [2**24, 500])
@@ -54,9 +56,11 @@ passes({"aamode": "noise", "spp": 32}, name="rounds")
 def test_no_two_rays_draw_the_same(options, at_once, monkeypatch):
     """Of some thousand rays, two have the same 48 bits by chance once in ten million renders."""
     monkeypatch.setattr(Workspace, "rays_at_once", lambda self, channels: at_once)
-    scene = mi.load_dict(mrt.scene_dict(0, **SIZE))
+    nodes = mrt.scene_dict(0, **SIZE)
+    nodes["sensor"]["sampler"] = {"type": options.get("sampler", "independent"), "sample_count": 4}
     integrator = recorder()
-    result = mrt.render(scene, integrator=integrator, seed=3, **options)
+    options = {name: value for name, value in options.items() if name != "sampler"}
+    result = mrt.render(mi.load_dict(nodes), integrator=integrator, seed=3, **options)
     drawn = np.concatenate(integrator.drawn)
     assert len(drawn) == result.rays["primary"] > 24 * 18
     assert len(np.unique(drawn)) == len(drawn)

@@ -57,6 +57,8 @@ def test_render_writes_and_says_what_the_report_says(tmp_path, capsys):
         ("3 aamode=noise", "AA:         as noise needs"),
         ("scene=a.xml", "Width:      from the file"),
         ("scene=a.obj", "AA mode:    sobel"),
+        ("3 target=2%", "AA mode:    noise"),
+        ("scene=a.xml target=0.01", "AA mode:    noise"),
     ],
 )
 def test_banner_names_what_is_in_force(words, line):

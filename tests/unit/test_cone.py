@@ -76,6 +76,24 @@ def test_positions_differentiate_with_the_parameters(name):
         assert dr.grad(by)[0] == pytest.approx((above - below) / 2e-2, rel=2e-2, abs=2e-2)
 
 
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_moved_shape_is_the_one_made_there(variant, name):
+    """Under a transform that stretches, normals do not go with the points."""
+    ends = [key for key in SHAPES[name] if key not in ("type", "radius")]
+    placed = {"segments": 16, "to_world": mi.ScalarTransform4f().rotate([1, 2, 3], 40).scale([1, 3, 0.5])}
+    now = {ends[0]: [1.0, 0.2, 2.0], ends[1]: [0.1, 0.3, -0.4], "radius": 0.3}
+    made = shape(name, **placed, **now)
+    moved = shape(name, **placed)
+    parameters = mi.traverse(moved)
+    for key, value in now.items():
+        parameters[key] = value
+    parameters.update()
+    for buffer in ("vertex_positions", "vertex_normals"):
+        there, expected = (np.array(mi.traverse(mesh)[buffer]) for mesh in (moved, made))
+        assert there == pytest.approx(expected, abs=1e-5)  # one of both is worked out in float32
+
+
 def test_shapes_of_one_material_stay_apart():
     """Mitsuba merges meshes that share a material; a merged one would have lost its frame or equation."""
     kinds = SHAPES | {"plane": {"type": "mrt_plane", "normal": [0, 1, 0]}}

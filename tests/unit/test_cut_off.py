@@ -78,6 +78,17 @@ def test_what_is_cut_off_is_not_seen(content, options):
     assert np.abs(whole - picture(scene, **options)).max() < STEP / 16
 
 
+def test_a_mirror_whose_bounces_cost_more_bounds_nothing():
+    """Rays may keep to the cheaper ones, which it leaves as many bounces as they had."""
+    dear = glass(0.9, int_ior=0.5, fresnel="unity")
+    planes = mirrors(1.5, specular_reflectance=0.98) | {"light": LIGHT}
+    integrator = mi.load_dict({"type": "mrt_whitted"})
+    without = integrator.prepare(loaded(planes)).plan.cut_off
+    ball = {"type": "sphere", "radius": 0.2, "bsdf": dear}
+    assert integrator.prepare(loaded(planes | {"ball": ball})).plan.cut_off == pytest.approx(without)
+    assert without[1] > 8  # a light, seen at all hits
+
+
 def test_facing_planes_of_any_reflectance_give_numbers():
     """A throughput that leaves float32, times no light, is no light."""
     planes = mirrors(7.0, specular_reflectance=1e5)

@@ -89,6 +89,17 @@ def test_a_held_interrupt_is_heeded_at_safe_places_and_a_second_one_anywhere(mon
     interrupts.heed()  # nothing is left
 
 
+def test_a_signal_that_comes_twice_while_held_is_acted_on_once():
+    """A terminal sends it to a group of processes, whose leader may send it once more."""
+    seen = []
+    signal.signal(signal.SIGINT, lambda number, frame: seen.append(number))
+    with interrupts.held():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        assert seen == []
+    assert seen == [signal.SIGINT]
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
 def test_mi_render_leaves_no_handler(variant):
     """Mitsuba's, left behind, called itself for ever at the next Ctrl-C, or an integrator that was gone."""

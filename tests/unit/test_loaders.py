@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import ExitStack
 from typing import Any
 
 import drjit as dr
@@ -12,6 +13,7 @@ from nodes import scene_xml
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
+from mrt_mitsuba.mitsuba_changes import two_threads
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -51,6 +53,22 @@ def test_loading_leaves_as_many_threads_as_there_were(name):
     dr.set_thread_count(1)
     try:
         getattr(mi, name)(LOADED[name])
+        assert dr.thread_count() == 1
+    finally:
+        dr.set_thread_count(before)
+
+
+def test_the_last_of_overlapping_loads_takes_the_second_thread_back():
+    """Two threads of Python may load at once, and the first to be done leaves the other its threads."""
+    before = dr.thread_count()
+    first, second = ExitStack(), ExitStack()
+    dr.set_thread_count(1)
+    try:
+        first.enter_context(two_threads)
+        second.enter_context(two_threads)
+        first.close()
+        assert dr.thread_count() == 2
+        second.close()
         assert dr.thread_count() == 1
     finally:
         dr.set_thread_count(before)

@@ -84,6 +84,7 @@ refused("camera=1,2,3", "camera is of use only with an OBJ file: scene=PATH.obj"
 refused("scene=a.xml texturing=standard", "texturing is of use only with an OBJ file")
 refused("scene=a.obj target=nan,0,0", "must be a positive number, or three")
 refused("scene=a.obj fov=0", "must be degrees, more than 0 and less than 180")
+refused("scene=a.obj fov=180", "fov=180: must be degrees, more than 0 and less than 180")
 refused("scene=a.obj up=0,0,0", "up must have a length")
 refused("scene=a.obj camera=1,2,3 target=1,2,3", "camera and target are the same point")
 refused("three", "('mrt scenes' lists them); a file is scene=PATH")

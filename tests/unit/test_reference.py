@@ -58,6 +58,15 @@ def test_bounce_budget_between_two_mirrors(ior, settings, surfaces):
     assert_allclose(found, expected, **EXACT)
 
 
+def test_a_surface_is_lit_on_its_outer_side_alone():
+    """From within a ball, no light is seen behind its wall, nor what the wall would reflect."""
+    light = Light((-9, 4, 0), (2.0, 2.0, 2.0))
+    around = scene(Sphere((0, 0, 0), 5, WOOD), lights=[light], sky=(1.0, 1.0, 1.0))
+    assert (pixel(around) == 0).all()
+    before = scene(Sphere((-7, 0, 0), 5, WOOD), lights=[replace(light, position=(9, 4, 0))])
+    assert (pixel(before) > 0).all()
+
+
 CONE = Cone((0, 1, 0), (0, 0, 0), 0.5, WOOD)
 TUBE = Cylinder((0, -1, 0), (0, 2, 0), 0.5, WOOD)
 CORNERS = np.array([(0, -1, -1), (0, -1, 3), (0, 3, -1)], float)

@@ -13,13 +13,20 @@ from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.rendering.api import render
 
 
+@pytest.mark.parametrize("beneath", [None, "rectangle", "mrt_plane"])
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])
-def test_large_surfaces_near_the_origin_have_no_dark_spots(variant, kind):
-    """What a hit is off by goes with the coordinates of the shape, not with its own, which are near zero."""
+def test_large_surfaces_near_the_origin_have_no_dark_spots(variant, kind, beneath):
+    """What a hit is off by goes with the coordinates of the shape, not with its own, which are near zero; nor
+    with what a flat shape beneath it would be off by."""
     numbers = {"sphere": [[0, -1000, 0, 1000]], "cylinder": [[-900, -1000, 0, 900, -1000, 0, 1000]]}[kind]
     scene = {"type": "scene", "large": group(numbers, kind=kind)}
     scene["sensor"] = sensor([0.3, 2, 3], [0, 0, 0], (160, 120), fov=20)
     scene["light"] = {"type": "mrt_light", "position": [0.3, 2, 3]}
+    if beneath == "rectangle":
+        turn = mi.ScalarTransform4f().translate([0, -0.1, 0]).rotate([1, 0, 0], -90)
+        scene["beneath"] = floor(beneath, 2.0, turn)
+    elif beneath:
+        scene["beneath"] = {"type": beneath, "normal": [0, 1, 0], "distance": 0.1}
     assert (render(scene, aa=1, lattice="report").image > 0.02).all()
 
 
