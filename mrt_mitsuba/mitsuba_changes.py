@@ -36,24 +36,21 @@ HINTS = (b"mrt_", b"<include", b"&#", b'type="$', b"type='$", b"\0")
 
 
 class Turn:
-    """A lock that a thread may take several times, and that is free in a process forked by another thread."""
+    """A lock that a thread may take several times, and that is free in a process forked by another thread.
+
+    Taken by ``with turn.lock``: an interrupt cannot come between taking it and knowing that it must be given
+    back, as it can in a method in Python.
+    """
 
     def __init__(self) -> None:
-        self._lock = threading.RLock()
-        self._mine = threading.local()
+        self.lock = threading.RLock()
         os.register_at_fork(after_in_child=self._forked)
 
-    def __enter__(self) -> None:
-        self._lock.acquire()
-        self._mine.count = getattr(self._mine, "count", 0) + 1
-
-    def __exit__(self, *_: object) -> None:
-        self._mine.count -= 1
-        self._lock.release()
-
     def _forked(self) -> None:
-        if not getattr(self._mine, "count", 0):  # the thread that holds it is not in this process
-            self._lock = threading.RLock()
+        if self.lock.acquire(blocking=False):
+            self.lock.release()
+        else:  # the thread that holds it is not in this process
+            self.lock = threading.RLock()
 
 
 #: taken while Mitsuba is set up, and while it renders what this project made: there, neither it nor Dr.Jit is
@@ -69,6 +66,7 @@ class Replacement:
     """A function that was put in place of one of Mitsuba's."""
 
     owner: Any
+    home: Any  # the module that the function is pickled by, or the owner
     name: str
     theirs: Function
     ours: Function
@@ -81,9 +79,8 @@ class Replacement:
             delattr(self.owner, self.name)
         elif alone:
             setattr(self.owner, self.name, self.theirs)
-        home = _home(self.owner, self.name, self.theirs)
-        if getattr(home, self.name) is self.ours:
-            setattr(home, self.name, self.theirs)
+        if getattr(self.home, self.name) is self.ours:
+            setattr(self.home, self.name, self.theirs)
         return alone
 
 
@@ -102,12 +99,11 @@ class Change:
         """Put our function in place where it is not, in the current variant."""
         _, *path, name = self.where.split(".")
         owner = reduce(getattr, path, mi)
-        theirs = around = getattr(owner, name)
+        theirs = getattr(owner, name)
         own = {id(each.ours) for each in self.made}
-        while around is not None:
-            if id(around) in own:
+        with contextlib.suppress(ValueError):  # what has itself, or ever more functions, inside of it
+            if id(inspect.unwrap(theirs, stop=lambda function: id(function) in own)) in own:
                 return
-            around = getattr(around, "__wrapped__", None)
 
         @wraps(theirs)
         def call(*args: object, **given: object) -> object:
@@ -115,8 +111,9 @@ class Change:
 
         with contextlib.suppress(ValueError, TypeError):  # functions in C++ have none
             call.__signature__ = inspect.signature(theirs)  # type: ignore[attr-defined]
-        self.made.append(Replacement(owner, name, theirs, call, inherited=name not in vars(owner)))
-        for each in (owner, _home(owner, name, theirs)):
+        home = _home(owner, name, theirs)
+        self.made.append(Replacement(owner, home, name, theirs, call, inherited=name not in vars(owner)))
+        for each in (owner, home):
             setattr(each, name, call)
 
     def undo(self) -> None:
@@ -127,7 +124,7 @@ class Change:
 def _home(owner: Any, name: str, function: Function) -> Any:
     """Return the module that a function of Mitsuba's is pickled by, or its owner."""
     module = sys.modules.get(getattr(function, "__module__", None) or "")
-    return module if module is not None and inspect.ismodule(owner) and hasattr(module, name) else owner
+    return module if inspect.ismodule(owner) and getattr(module, name, None) is function else owner
 
 
 CHANGES: list[Change] = []
@@ -144,6 +141,11 @@ def change(where: str, *, what: str, why: str) -> Callable[[Function], Function]
     return add
 
 
+def _argument(place: int, name: str, args: tuple[Any, ...], given: dict[str, Any]) -> Any:
+    """Return an argument of one of Mitsuba's functions, None where there is none: Mitsuba says so."""
+    return args[place] if place < len(args) else given.get(name)
+
+
 # ------------------------------------------- Rendering in turn -----------------------------------------
 
 
@@ -156,7 +158,10 @@ def needs_turn(scene: mi.Scene, integrator: mi.Integrator) -> bool:
     """Return whether a render runs Python code of ours, and none of somebody else's that may wait for it."""
     if of_this_package(integrator):
         return True
-    if not plugins.any_constructed() or not plugins.is_known(integrator):
+    if not plugins.any_constructed() or not isinstance(integrator, mi.Integrator):
+        return False
+    inside = mi.traverse(integrator).hierarchy  # aov renders with others
+    if not all(plugins.is_known(each) for each in inside if isinstance(each, mi.Integrator)):
         return False
     shapes = scene.shapes()
     materials = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in shapes)}
@@ -172,13 +177,11 @@ def needs_turn(scene: mi.Scene, integrator: mi.Integrator) -> bool:
     "integrator in Python into a RuntimeError",
 )
 def render_in_turn(render: Function, /, *args: object, **given: object) -> object:
-    named = dict(zip(inspect.signature(render).parameters, args, strict=False)) | given
-    scene = named.get("scene")
-    if not isinstance(scene, mi.Scene):
+    scene = _argument(0, "scene", args, given)
+    integrator = _argument(3, "integrator", args, given)
+    if not isinstance(scene, mi.Scene) or not needs_turn(scene, integrator or scene.integrator()):
         return render(*args, **given)
-    if not needs_turn(scene, named.get("integrator") or scene.integrator()):
-        return render(*args, **given)
-    with one_at_a_time:
+    with one_at_a_time.lock:
         try:
             return render(*args, **given)
         except RuntimeError as error:
@@ -192,9 +195,9 @@ def render_in_turn(render: Function, /, *args: object, **given: object) -> objec
     what="waits while such a scene is rendered",
     why="a change in the midst of a render ends the process",
 )
-def set_in_turn(setitem: Function, /, *args: object) -> object:
-    with one_at_a_time:
-        return setitem(*args)
+def set_in_turn(setitem: Function, /, *args: object, **given: object) -> object:
+    with one_at_a_time.lock:
+        return setitem(*args, **given)
 
 
 @change(
@@ -203,10 +206,11 @@ def set_in_turn(setitem: Function, /, *args: object) -> object:
     why="numbers may have been written where they lie, which no array shows",
 )
 def update_in_turn(
-    update: Function, parameters: mi.SceneParameters, /, *args: object, **given: object
+    update: Function, /, *args: object, **given: object
 ) -> list[tuple[mi.Object, set[str]]]:
-    with one_at_a_time:
-        updated = update(parameters, *args, **given)
+    with one_at_a_time.lock:
+        updated = update(*args, **given)
+        parameters = _argument(0, "self", args, given)
         changed = dict(updated) if plugins.any_constructed() else {}
         # What contains an object whose own parameters were updated is updated, too
         for key, (_, _, node, _) in parameters.properties.items() if changed else ():
@@ -312,19 +316,18 @@ def _load(load: Function, ours: bool, source: str, /, *args: object, **given: ob
     what="refuses scenes with mrt_light",
     why="the light cannot do so itself: Dr.Jit calls its methods for scenes that have none, too",
 )
-def refuse_light_tracing(
-    render: Function, integrator: mi.Integrator, scene: mi.Scene, *args: object, **given: object
-) -> object:
+def refuse_light_tracing(render: Function, /, *args: object, **given: object) -> object:
+    scene = _argument(1, "scene", args, given)
     kind = plugins.plugin("light").MrtLight
     names = {row.class_name: row.name for row in plugins.PLUGINS}
-    for light in scene.emitters():
+    for light in scene.emitters() if isinstance(scene, mi.Scene) else ():
         if isinstance(light, kind):
             name = type(light).__name__
             raise NotImplementedError(
                 f"{names.get(name, name)}: light tracing needs a finite emitted power; use a stock 'point' "
                 "light"
             )
-    return render(integrator, scene, *args, **given)
+    return render(*args, **given)
 
 
 # --------------------------------------------- Putting in effect ---------------------------------------

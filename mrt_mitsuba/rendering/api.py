@@ -160,7 +160,7 @@ def refuse_freezing() -> None:
 def session(settings: RenderSettings) -> Iterator[Job]:
     """Let one render run alone, in the variant that the settings name, and measure what it costs."""
     refuse_freezing()
-    with runtime.one_at_a_time, held(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    with runtime.one_at_a_time.lock, held(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         budget = Budget.of(cast("int | None", settings.memory))
         job = Job(settings.progress or default_progress(), budget, settings.on_round)

@@ -34,7 +34,7 @@ class Prepared:
     def __init__(self, scene: Any, options: dict[str, Any]) -> None:
         self._scene = scene
         self._settings = RenderSettings.of(**options)
-        with runtime.one_at_a_time, held():
+        with runtime.one_at_a_time.lock, held():
             self._render(self._settings.seed)
             self._film_window = _window(self._source.sensor.film())
             self.params = mi.traverse(self._source.scene)
@@ -43,7 +43,7 @@ class Prepared:
     def __call__(self, seed: int = 0) -> Result:
         """Render the scene as it is now; ``seed`` is of all random numbers."""
         refuse_freezing()
-        with runtime.one_at_a_time, held(), runtime.within(self._made.plan.variant):
+        with runtime.one_at_a_time.lock, held(), runtime.within(self._made.plan.variant):
             self.params.update()
             self._resize()
             if self._launch is None:

@@ -66,7 +66,7 @@ def render_job(
     facts = {"attempts": facts["attempts"] + 1, "worker": worker.address}
     write_note(note, facts)
     try:
-        with runtime.one_at_a_time:
+        with runtime.one_at_a_time.lock:
             here = describe(folder)
             if here["versions"] != versions:
                 raise MrtError(f"the worker has {here['versions']}; the sweep began with {versions}")

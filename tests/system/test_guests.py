@@ -28,6 +28,12 @@ def tried(function, *arguments):
     except Exception as error:
         return type(error).__name__
 
+def refusal(function, *arguments):
+    try:
+        function(*arguments)
+    except Exception as error:
+        return error
+
 def look():
     facts = {}
     for owner, names in functions():
@@ -37,6 +43,15 @@ def look():
                 *(getattr(function, key) for key in ("__name__", "__qualname__", "__module__", "__doc__")),
                 str(tried(inspect.signature, function)),
             )
+    nothing = mi.traverse(mi.load_dict({"type": "sphere"}))
+    nothing.__setitem__(key="to_world", value=mi.Transform4f())
+    nothing.update(values={"to_world": mi.Transform4f()})
+    # What is wrong with a call, in words of Mitsuba's or Python's
+    facts["wrong calls"] = [
+        (type(error).__name__, str(error))
+        for owner, names in functions() for name in names for given in [(), (3,), (3, 4)]
+        for error in [refusal(getattr(owner, name), *given)]
+    ]
     facts["arguments"] = inspect.getfullargspec(mi.render), inspect.getfullargspec(mi.SceneParameters.update)
     facts["pickle"] = pickle.dumps(mi.render), pickle.dumps(mi.SceneParameters.update)
     assert pickle.loads(facts["pickle"][0]) is mi.render
@@ -102,23 +117,28 @@ import mrt_mitsuba as mrt
 mrt.register()
 import mitsuba as mi
 os.mkdir("folder")
+os.symlink("/dev/zero", "zeros.xml")
 with open("huge.xml", "wb") as file:
     file.truncate(2**40)  # takes no place on the disk
 resource.setrlimit(resource.RLIMIT_AS, (2**33, 2**33))
-for path in ("/dev/zero", "folder", "missing.xml", "huge.xml"):
+for path in ("/dev/zero", "zeros.xml", "folder", "missing.xml", "huge.xml"):
     try:
         print(path, len(mi.load_file(path).shapes()))
     except RuntimeError as error:
         print(path, "refused")
     except MemoryError:
         print(path, "refused")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2**21, path  # KiB
 """
+
+
+REFUSED = ("/dev/zero", "zeros.xml", "folder", "missing.xml", "huge.xml")
 
 
 def test_files_are_read_no_further_than_needed(run_python):
     """Zeros without end were read until memory ended; ``run_python`` waits five minutes."""
     lines = run_python(FILES).stdout.splitlines()
-    assert lines == [f"{path} refused" for path in ("/dev/zero", "folder", "missing.xml", "huge.xml")]
+    assert lines == [f"{path} refused" for path in REFUSED]
 
 
 THREADS = """
@@ -145,6 +165,9 @@ class Threaded(mi.SamplingIntegrator):
         thread.join()
         return found[0]
 
+    def sample(self, *arguments):
+        return self.inner.sample(*arguments)
+
 mi.register_integrator("threaded", Threaded)
 mi.load_dict({"type": "mrt_bsdf"})  # there are some of ours
 for kind in ("diffuse", "mrt_bsdf"):
@@ -155,12 +178,14 @@ for kind in ("diffuse", "mrt_bsdf"):
         "ball": {"type": "sphere", "center": [0, 0, 4],
                  "bsdf": {"type": kind, key: {"type": "rgb", "value": 0.5}}}})
     print(mi.render(scene).shape)
+    around = {"type": "aov", "aovs": "depth:depth", "nested": scene.integrator()}
+    print(mi.render(scene, integrator=mi.load_dict(around), spp=2).shape)
 """
 
 
 def test_an_integrator_may_render_in_threads_of_its_own(run_python):
-    """It waited for ever for its own render to end."""
-    assert run_python(THREADS).stdout.splitlines() == ["(6, 8, 3)"] * 2
+    """It waited for ever for its own render to end, also inside of ``aov``."""
+    assert run_python(THREADS).stdout.splitlines() == ["(6, 8, 3)", "(6, 8, 4)"] * 2
 
 
 FORK = """
@@ -253,6 +278,72 @@ def test_somebody_elses_wrapper_is_not_taken_for_ours(run_python):
     assert run_python(WRAPPERS).stdout.splitlines() == ["1500 True", "1500 2", "1 2", "1500"]
 
 
+KINDS_OF_WRAPPERS = """
+import functools, sys
+import mrt_mitsuba as mrt
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+home = sys.modules["mitsuba.python.util"]
+theirs = home.render
+
+def plain(function):
+    return lambda *args, **given: function(*args, **given)
+
+def in_itself(function):
+    def call(*args, **given):
+        return function(*args, **given)
+    call.__wrapped__ = call
+    return call
+
+def looking_up(function):
+    return functools.wraps(function)(lambda *args, **given: home.render(*args, **given))
+
+film = {"type": "hdrfilm", "width": 4, "height": 4}
+scene = {"type": "scene", "integrator": {"type": "mrt_whitted"}, "light": {"type": "mrt_light"},
+         "sensor": {"type": "perspective", "film": film}}
+for wrap in (plain, in_itself, looking_up):
+    mi.render = wrapped = wrap(theirs)
+    mrt.register()
+    print(mi.render(mi.load_dict(scene), spp=1).shape, mi.render is not wrapped)
+    mrt.register(guard=False)
+    print(mi.render is wrapped, home.render is theirs)
+"""
+
+
+def test_wrappers_of_any_kind_stay_and_are_found_again(run_python):
+    """One that has itself inside was followed for ever, and one that looks Mitsuba's up called itself."""
+    lines = run_python(KINDS_OF_WRAPPERS).stdout.splitlines()
+    assert lines == ["(4, 4, 3) True", "True True"] * 3
+
+
+STORM = """
+import random, signal, threading
+import mrt_mitsuba as mrt
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+mrt.register()
+parameters = mi.traverse(mi.load_dict({"type": "sphere"}))
+key = next(key for key in parameters.keys() if key.endswith("reflectance.value"))
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+for _ in range(1000):
+    try:
+        signal.setitimer(signal.ITIMER_REAL, random.uniform(2e-5, 2e-4))
+        while True:
+            parameters[key] = 0.3
+    except KeyboardInterrupt:
+        pass
+thread = threading.Thread(target=lambda: parameters.update({key: 0.2}), daemon=True)
+thread.start()
+thread.join(20)
+print(thread.is_alive())
+"""
+
+
+def test_interrupts_leave_no_lock_held(run_python):
+    """One of 23 did, between taking it and noting so; other threads then waited for ever."""
+    assert run_python(STORM).stdout.split() == ["False"]
+
+
 COUNTS = """
 import sys, threading
 import mrt_mitsuba as mrt
@@ -301,8 +392,12 @@ def test_changes_follow_the_variant(run_python):
 INTERRUPT = """
 import os, signal, sys, threading
 import mrt_mitsuba as mrt
-mrt.register()
 import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+render = mi.render
+if len(sys.argv) > 3:  # somebody else's, which does not say what it is around
+    mi.render = lambda *args: render(*args)
+mrt.register()
 box = mi.cornell_box()
 nested = {"type": sys.argv[1]}
 scene = mi.load_dict(box | {"integrator": {
@@ -320,6 +415,12 @@ except BaseException as error:
 def test_ctrl_c_during_mrt_adaptive_is_a_keyboard_interrupt(run_python, nested, delay):
     lines = run_python(INTERRUPT, nested, str(delay)).stdout.splitlines()
     assert lines[-1].endswith("KeyboardInterrupt True")  # after what Mitsuba logs
+
+
+def test_ctrl_c_passes_a_wrapper_without_a_signature(run_python):
+    """Ours did not find the scene among the arguments of such a function, and stood aside."""
+    lines = run_python(INTERRUPT, "path", "2.0", "wrapped").stdout.splitlines()
+    assert lines[-1].endswith("KeyboardInterrupt True")
 
 
 def test_every_change_is_on_the_page() -> None:

@@ -25,12 +25,16 @@ COLORS = {"diffuse_reflectance": rgb(0.2, 0.5, 0.3), "specular_reflectance": rgb
 
 
 def scene(**content: Any) -> mi.Scene:
-    """A floor, a ball and a cone under nine lights, which is more than the kernels hold the code of."""
+    """A floor, a ball and a cone under nine lights, which is more than the kernels hold the code of.
+
+    All have an ``mrt_bsdf``: tables are made of lights and materials.
+    """
     nodes: dict[str, Any] = {"type": "scene", "integrator": {"type": "mrt_whitted"}}
     nodes["sensor"] = sensor([0, 1, 6], [0, 0, 0], (16, 12))
     nodes["floor"] = {"type": "mrt_plane", "normal": [0, 1, 0], "distance": 1.0, "bsdf": {"type": "mrt_bsdf"}}
     nodes["ball"] = {"type": "sphere", "bsdf": {"type": "mrt_bsdf", "alpha": 0.3} | COLORS}
-    nodes["cone"] = {"type": "mrt_cone", "apex": [2, 1, 0], "base_center": [2, -1, 0], "radius": 0.8}
+    ends = {"apex": [2, 1, 0], "base_center": [2, -1, 0]}
+    nodes["cone"] = {"type": "mrt_cone", **ends, "radius": 0.8, "bsdf": {"type": "mrt_bsdf"}}
     dim = rgb(0.1, 0.1, 0.1)
     for k in range(9):
         nodes[f"lamp{k}"] = {"type": "mrt_light", "position": [k - 4, 3, 4], "intensity": dim}

@@ -88,7 +88,7 @@ def test_a_change_waits_for_a_render_in_another_thread(act):
     parameters = mi.traverse(mi.load_dict({"type": "constant", "radiance": 1.0}))
     done = threading.Event()
     thread = threading.Thread(target=lambda: (act(parameters), done.set()))
-    with runtime.one_at_a_time:
+    with runtime.one_at_a_time.lock:
         thread.start()
         assert not done.wait(0.3)  # without the lock, it takes less than a thousandth of that
     assert done.wait(60)
