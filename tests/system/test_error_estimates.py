@@ -151,3 +151,10 @@ def test_whole_pictures_state_their_error():
         result = mrt.render(scene, integrator="ptracer", aamode="noise", spp=64, seed=seed)
         ratios.append(result.error.rmse / _rmse(result.image, truth))
     assert 0.6 < np.median(ratios) < 1.6
+
+
+def test_a_header_says_that_an_error_has_no_upper_end():
+    with pytest.warns(mrt.MrtWarning, match="a few rays rule the error"):
+        result = mrt.render(camera(24, 16), integrator=noise(rare=0.0005), aamode="noise", spp=64, seed=1)
+    assert result.error.high == math.inf
+    assert result.header()["mrt:error"]["high"] is None

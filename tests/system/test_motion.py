@@ -149,3 +149,11 @@ def test_depth_is_that_of_the_moment_when_the_shutter_opens(mode, lattice, atol)
     )
     near = np.isfinite(depth) & np.isfinite(still) & (still < 5)
     assert np.median(np.abs(depth[near] - still[near])) <= atol
+
+
+@pytest.mark.parametrize("moments", [4, 10, 12])
+def test_a_film_has_at_least_as_many_moments_as_asked_for(moments):
+    options = {"aa": 2, "aamode": "none", "lattice": "film", "focaldist": 0, "width": 8, "height": 6}
+    options |= {"motion": WAY, "motionsamples": moments, "motionmode": "stratified"}
+    rays = mrt.render(0, **options).rays["primary"] / 48
+    assert moments <= rays < moments + 4  # as many for each of four places

@@ -67,6 +67,8 @@ cut(balls(), {"sky": 1000.0}, name="own sky")
 cut(balls(light=LIGHT | {"intensity": 1e4}), {"clamp": False}, name="unclamped")
 cut(balls(light=LIGHT | {"type": "point", "intensity": 1e5}), {"clamp": False}, name="with falloff")
 cut(balls(lamp=LAMP), {}, name="lamp")
+DIM_LAMP = {**LAMP, "center": [3, 3, 0], "emitter": {"type": "area", "radiance": 1e-3}}
+cut(balls(lamp=LAMP, dim=DIM_LAMP), {}, name="lamp, and a dim one")
 cut(mirrors(1.5, specular_reflectance=0.98, alpha=1.0) | hidden_lights(6, 3.5e-4), {}, name="mirrors")
 cut(hidden_lights(8, 5e-4) | {"floor": FLOOR}, {}, name="lights")
 

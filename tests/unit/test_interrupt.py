@@ -116,3 +116,21 @@ def test_mi_render_leaves_no_handler(variant):
         dr.backward(dr.mean(mi.render(scene, params, spp=1)))
         assert np.isfinite(dr.grad(params[key])).all()
         assert handler(signal.SIGINT) == before
+
+
+DEAF = """
+import os, signal, time
+from mrt_mitsuba.interrupts import ending_soon
+with ending_soon(lambda: print("tidied")):
+    signals = [signal.SIGTERM]
+    while True:
+        try:
+            os.kill(os.getpid(), signals.pop())
+        except BaseException:
+            time.sleep(0.01)
+"""
+
+
+def test_a_program_that_does_not_end_by_itself_is_ended(run_python):
+    """With the code by which a shell knows the signal."""
+    assert run_python(DEAF, code=128 + signal.SIGTERM).stdout == "tidied\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cases import Cases
 
@@ -160,3 +161,23 @@ print(mrt.render({"type": "scene", "lamp": lamp, "camera": camera}).image.mean()
 def test_one_thread_is_enough_for_exr_files(run_python):
     """Mitsuba waited for another one for ever, in each worker of a sweep with as many workers as cores."""
     assert run_python(EXR).stdout.split() == ["1.0", "1"]
+
+
+def test_half_of_what_is_free_is_used_unless_asked_for(monkeypatch):
+    monkeypatch.setattr(machine, "memory", lambda: (2**33, 2**35))
+    assert Budget.of(None).size == 2**32
+    assert Budget.of(2**34).size == 2**34
+    assert Budget.of(2**36).size == 2**35
+
+
+@pytest.mark.parametrize(("kind", "bytes_of_texel"), [("bitmap", 24), ("envmap", 40)])
+def test_pictures_of_a_scene_take_their_memory(variant, tmp_path, kind, bytes_of_texel):
+    import mitsuba as mi
+
+    from mrt_mitsuba.scene.loading import load_dict
+
+    file = str(tmp_path / "a.exr")
+    mi.Bitmap(np.ones((8, 16, 3), np.float32)).write(file)
+    budget = Budget(2**20)
+    load_dict({"type": kind, "filename": file}, budget=budget)
+    assert budget.taken == 8 * 16 * bytes_of_texel
