@@ -32,6 +32,7 @@ JUDGES = 2**11  # pixels, about, that choose the mixture
 LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB
 MISSED = 0.25  # of a pixel like those that make up the noise: it may be among the others, unseen
 STATED = 2  # squared errors that a stated variance counts as much as
+KEPT = 0.75  # of the power by which sequences gain: it falls with their length
 LEAST_RATIO = 0.05  # of squared errors to stated variances, to be believed: rare ones may be missing
 
 
@@ -60,6 +61,7 @@ class Halves(Stack):
         self._total = np.zeros((3, 4, *film.shape), np.float32)
         self._square = np.zeros((4, *film.shape))  # mean of colours, as the next
         self._peak = np.zeros((4, *film.shape), np.float32)
+        self._earlier: tuple[float, np.ndarray] | None = None
         self._bad, self._unfit = np.zeros(film.shape, bool), 0.0
 
     # ------------------------------------------- Rounds ---------------------------------------------
@@ -74,6 +76,9 @@ class Halves(Stack):
 
     def trace(self, chosen: np.ndarray, advance: Callable[[int], object]) -> None:
         """Trace groups of rays."""
+        if self.rays.all():
+            _, halves = _compared(self._gathered([0]), self._gathered([1]))
+            self._earlier = self.rays.mean(), halves
         counts = np.concatenate([self.widened(chosen[:2]), chosen[2:]])
         groups = Groups.spread(self.group, counts, self._traced)
         scalar = mi.variant().startswith("scalar")
@@ -248,12 +253,31 @@ class Halves(Stack):
         fields = np.stack([self._board == field for field in range(self._board.max() + 1)])
         _, halves = _compared(self._gathered([0]), self._gathered([1]))
         near = _near(halves * ~fields[:, None], WINDOWS[2:]) if len(fields) > 1 else None
+        each = (1 / self.rows(self.rays)).sum(0) / 4  # of a ray's variance is in the squares of halves
         chosen = np.zeros((4, self.film.pixels), np.int64)
         for index in HALVES:
             views = self._decisive([1 - index], SCOUTS, near).reshape(fields.shape)
             for field, variance in zip(fields, views, strict=True):
-                chosen[index] += self._share(index, variance, room / 2 * field.mean(), target, field, 0)
+                gain = 0.0
+                if near is not None:
+                    variance = _calibrated(variance * each, halves[0], ~field) / each
+                    gain = self._gain(~field, halves)
+                chosen[index] += self._share(
+                    index, variance, room / 2 * field.mean(), target, field, 0, gain
+                )
         return chosen
+
+    def _gain(self, among: np.ndarray, halves: np.ndarray) -> float:
+        """By what power of the rays, beyond the first, variance falls in some pixels [H, W], as the squares of
+        halves and what they are for independent rays have it, [2, H, W], now and a round before."""
+        if self._earlier is None:
+            return 0.0
+        rays, earlier = self._earlier
+        now, then = (values[:, among].sum(1) for values in (halves, earlier))
+        if min(*now, *then) <= 0:
+            return 0.0
+        power = math.log(then[0] / then[1] * now[1] / now[0]) / math.log(self.rays.mean() / rays)
+        return KEPT * min(max(power, 0.0), 0.5)
 
     def _share(
         self,
@@ -263,6 +287,7 @@ class Halves(Stack):
         target: float | None,
         among: np.ndarray,
         even: float,
+        gain: float = 0.0,
     ) -> np.ndarray:
         """Return groups for a half: what a target takes, if the other half is like this one, or nearly, but
         no more than, what there is room for. Rays are a multiple of the deviation, or what there is."""
@@ -279,7 +304,9 @@ class Halves(Stack):
             groups = self._due(factor * deviation, have, rounding)
             fits = self.group * self.widened(groups[None]).sum() <= room
             best = groups if fits else best
-            if fits and (target is None or np.mean(variance / (have + self.group * groups)) > 2 * target**2):
+            rays = have + self.group * groups
+            left = variance / rays * (have / rays) ** gain
+            if fits and (target is None or left.mean() > 2 * target**2):
                 low = factor
             else:
                 high = factor
@@ -353,17 +380,18 @@ def _mixture(parts: np.ndarray, measured: np.ndarray) -> np.ndarray:
     return shares
 
 
-def _calibrated(variance: np.ndarray, squares: np.ndarray) -> np.ndarray:
+def _calibrated(variance: np.ndarray, squares: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
     """Return variances [H, W], each tenth of them, as they sort, drawn to the mean of its squared errors.
 
     The more squares make up that mean, the more: a tenth in which both halves missed the same rare rays has
-    none, and keeps what was stated.
+    none, and keeps what was stated. ``among``: the pixels whose squares count, [H, W]; None: all.
     """
     order, found = np.argsort(variance, axis=None), variance.copy()
     for tenth in np.array_split(order[np.count_nonzero(variance == 0) :], 10):
-        if len(tenth):
-            number, measured = _number(squares.flat[tenth]), squares.flat[tenth].mean()
-            ratio = max(measured / variance.flat[tenth].mean(), LEAST_RATIO)
+        judges = tenth if among is None else tenth[among.flat[tenth]]
+        if len(judges):
+            number, measured = _number(squares.flat[judges]), squares.flat[judges].mean()
+            ratio = max(measured / variance.flat[judges].mean(), LEAST_RATIO)
             found.flat[tenth] *= ratio ** (number / (number + STATED))
     return found
 

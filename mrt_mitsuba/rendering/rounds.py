@@ -28,6 +28,7 @@ MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too 
 LEAST = 2**18  # rays that a target takes at least: fewer do not show what is rare
 MORE = 2  # times the rays are doubled where the tail of their values is in doubt
 EVEN = 0.25  # of the mean deviation is the least that a pixel is given rays for, until there are as many
+NEAR = 1.05  # times a target is an error that reaches it, as far as it is known
 LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
 OnRound = Callable[[RoundPicture], object]
@@ -116,7 +117,7 @@ def _missed(goal: Goal, now: Round, error: ErrorEstimate) -> str:
     if late or now.spp * LEAST_GROWTH > rays:
         limit = f"maxseconds={seconds:g}" if late else f"maxspp={rays}"
         return f"{asked} is not reached: {limit} ends the render at {spent}"
-    if error.low <= target:
+    if now.rmse <= NEAR * target:
         return ""
     return (
         f"{asked} is missed by {spent}: rays that are not in the picture decide when to stop, and "
