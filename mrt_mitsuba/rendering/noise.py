@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
@@ -26,6 +27,7 @@ from mrt_mitsuba.rendering.exposing import Exposer, FilmStarts, Groups, Independ
 
 HALVES, SCOUTS = [0, 1], [2, 3]
 SUSPECT = 0.5  # shape of a tail where rare rays may rule
+EVENLY = 0.2  # of the pixels make up noise that is even
 TILE = 16  # pixels that round alike, under a filter: it has rays traced around all that need some
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
 JUDGES = 2**11  # pixels, about, that choose the mixture
@@ -34,6 +36,21 @@ MISSED = 0.25  # of a pixel like those that make up the noise: it may be among t
 STATED = 2  # squared errors that a stated variance counts as much as
 KEPT = 0.75  # of the power by which sequences gain: it falls with their length
 LEAST_RATIO = 0.05  # of squared errors to stated variances, to be believed: rare ones may be missing
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What scouts foresee of a picture's error."""
+
+    rmse: float  #: of the picture as it is
+    tail: float  #: Pareto shape of what their rays contribute
+    noisy: float  #: share of the pixels that make up the noise
+    variance: np.ndarray  #: of a pixel times its rays, [H, W]
+
+    @property
+    def even(self) -> bool:
+        """Is the noise in so many pixels that a few rays of each show it?"""
+        return self.noisy > EVENLY and self.tail < SUSPECT
 
 
 class Halves(Stack):
@@ -152,11 +169,12 @@ class Halves(Stack):
         colors = self.film.picture(np.moveaxis(total / rays, 0, -1))
         return float(colors.mean((0, 1)) @ LUMINANCE)
 
-    def forecast(self) -> tuple[float, float]:
-        """Return the RMSE of the picture, and the shape of its tail, as the scouts have them."""
-        self._scouted, self._shape = self._decisive([2], [3]), self._tail(SCOUTS)
-        left = self._inside(self._scouted / self.rows(self.rays).sum(0))
-        return math.sqrt(float(left.mean())), self._shape
+    def forecast(self) -> Forecast:
+        """The error of the picture as the scouts foresee it."""
+        variance = self._decisive([2], [3])
+        left = self._inside(variance / self.rows(self.rays).sum(0))
+        noisy = _number(_variance(self._gathered(SCOUTS))) / self.film.pixels
+        return Forecast(math.sqrt(float(left.mean())), self._tail(SCOUTS), noisy, variance)
 
     def variance(self) -> np.ndarray:
         """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
@@ -227,8 +245,15 @@ class Halves(Stack):
 
     # ------------------------------------------- Sharing --------------------------------------------
 
-    def next(self, most: float, rays: float, target: float | None, even: float = 0) -> np.ndarray:
-        """Return numbers of further groups; to be called after ``forecast``, but for the last of all rays.
+    def next(
+        self,
+        forecast: Forecast | None,
+        most: float,
+        rays: float,
+        target: float | None = None,
+        even: float = 0,
+    ) -> np.ndarray:
+        """Numbers of further groups; without a forecast, of the last round.
 
         The scouts decide until ``most`` rays a pixel are enough for an RMSE of ``target``, or are all of the
         ``rays`` to spend. The next round is the last then, and what a half gets in it is decided by the other
@@ -237,15 +262,15 @@ class Halves(Stack):
         so that no value moves its own weight. Before the last round, no pixel is taken for less noisy than
         ``even`` times the mean.
         """
-        room, self.last = most * self.film.pixels - self._traced.sum(), most >= rays
-        if target is not None:
-            deviation = np.sqrt(self._scouted.ravel())
+        room, self.last = most * self.film.pixels - self._traced.sum(), forecast is None or most >= rays
+        if forecast is not None and target is not None:
+            deviation = np.sqrt(forecast.variance.ravel())
             wanted = np.maximum(deviation * deviation.mean() / (2 * target**2) - self.rays[0], 0)
             self.last = self.last or wanted.sum() <= room / 2
-        if not self.last:
-            scouting = self.scouting[self._shape >= SUSPECT]
+        if forecast is not None and not self.last:
+            scouting = self.scouting[forecast.tail >= SUSPECT]
             room, everywhere = room / 2 / (1 + scouting), np.ones(self.film.shape, bool)
-            half = self._share(0, self._scouted, room, None, everywhere, even)
+            half = self._share(0, forecast.variance, room, None, everywhere, even)
             wanted = scouting * (self.rays[0] + self.group * half)
             scouts = self._due(wanted, self._traced[2], self._rounding())
             return np.stack([half, half, scouts, scouts])

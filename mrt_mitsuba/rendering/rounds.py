@@ -19,13 +19,14 @@ from mrt_mitsuba.rendering.progress import Advance
 from mrt_mitsuba.target import Goal
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.rendering.noise import Halves
+    from mrt_mitsuba.rendering.noise import Forecast, Halves
 
 log = logging.getLogger(__name__)
 
 GROWTH = 4.25  # times the rays there are may be there after another round: the error is known better then
 MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too high
 LEAST = 2**18  # rays that a target takes at least: fewer do not show what is rare
+LEAST_EVEN = 2**17  # where noise is even: fewer may miss what is rare in a small picture
 MORE = 2  # times the rays are doubled where the tail of their values is in doubt
 EVEN = 0.25  # of the mean deviation is the least that a pixel is given rays for, until there are as many
 NEAR = 1.05  # times a target is an error that reaches it, as far as it is known
@@ -46,7 +47,7 @@ def run_rounds(
     start, done, spent, pixels = time.perf_counter(), list[Round](), 0, picture.film.pixels
     rays, seconds, asked = goal.most, goal.seconds, goal.target
     target: float | None = None
-    least, doubled = min(rays, picture.least, LEAST / pixels) if asked else 0, 0
+    doubled = 0
     chosen, stopped = picture.first(), False
     while cost := picture.cost(chosen):
         spent += cost
@@ -67,13 +68,15 @@ def run_rounds(
         if picture.last or most < LEAST_GROWTH * now.spp:
             break
         # not asked for where all rays that are left are spent at once, whatever it says
-        forecast, tail = picture.forecast() if target or most < rays else (math.inf, 0.0)
+        forecast = picture.forecast() if target or most < rays else None
+        least = _least(picture, forecast, rays) if forecast and target else 0
         if now.spp < 0.9 * least:  # shares are rounded
-            chosen = picture.next(min(most, least), rays, None, EVEN)
-        elif target is None or forecast > target:
-            chosen = picture.next(most, rays, target and MARGIN * max(target, 1e-100))
-        elif tail > DOUBTFUL and doubled < MORE:
-            chosen, doubled = picture.next(min(most, 2 * now.spp), rays, None), doubled + 1
+            chosen = picture.next(forecast, min(most, least), rays, even=EVEN)
+        elif forecast is None or target is None or forecast.rmse > target:
+            chosen = picture.next(forecast, most, rays, target and MARGIN * max(target, 1e-100))
+        elif forecast.tail > DOUBTFUL and doubled < MORE:
+            chosen = picture.next(forecast, min(most, 2 * now.spp), rays)
+            doubled += 1
         else:
             break
     error = replace(picture.error(), target=target)
@@ -81,6 +84,12 @@ def run_rounds(
     if any(found):
         warnings.warn("; ".join(filter(None, found)), MrtWarning, stacklevel=7)  # the caller of render
     return done, error
+
+
+def _least(picture: Halves, forecast: Forecast, rays: float) -> float:
+    """The mean rays of a pixel that a target takes at least."""
+    least = LEAST_EVEN if forecast.even else LEAST
+    return min(rays, picture.least, least / picture.film.pixels)
 
 
 def _shown(now: Round, picture: Halves, target: float | None) -> RoundPicture:

@@ -438,8 +438,14 @@ def test_an_error_above_the_target_is_warned_of():
     for seed in range(24):
         with warnings.catch_warnings(record=True) as messages:
             warnings.simplefilter("always", mrt.MrtWarning)
-            result = mrt.render(scene, target=0.03, seed=seed)
+            result = mrt.render(scene, target=0.005, seed=seed)
         missed = any("is missed by an error" in str(message.message) for message in messages)
-        assert missed == (result.error.rmse > 1.05 * 0.03)
+        assert missed == (result.error.rmse > 1.05 * 0.005)
         above += missed
     assert 0 < above < 24
+
+
+@pytest.mark.parametrize(("kind", "least", "most"), [("calm", 12, 18), ("glass", 24, 36)])
+def test_a_target_takes_fewer_rays_at_least_where_noise_is_even(kind, least, most):
+    """2¹⁷ rays in a picture of 96 × 96 pixels, and 2¹⁸ where few pixels are noisy; shares are rounded."""
+    assert least < mrt.render(load_kind(kind, 96), target=0.1).rounds[-1].spp < most
