@@ -6,7 +6,7 @@ The modules are read, not imported, so that imports inside functions and for typ
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -27,6 +27,7 @@ ALLOWED = {
 
 FOUNDATION = {"errors", "interrupts", "machine", "mitsuba_changes", "target", "options", "runtime"}
 
+_INNER = ast.stmt | ast.excepthandler | ast.match_case  # of a statement, and with nodes of its own
 _BRANCH = ast.If | ast.IfExp | ast.For | ast.While | ast.ExceptHandler | ast.match_case | ast.comprehension
 
 
@@ -166,6 +167,54 @@ def test_functions_stay_within(measure, limit):
     assert {name: size for name, size in found.items() if size > limit} == {}
 
 
+def statements(trees: Iterable[ast.Module]) -> list[int]:
+    """The numbers of syntax nodes of all statements but docstrings, without those of statements inside them."""
+    sizes = []
+    for statement in (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.stmt)):
+        if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
+            continue
+        size = 0
+        waiting: list[ast.AST] = [statement]
+        while waiting:
+            node = waiting.pop()
+            size += not isinstance(node, ast.expr_context)
+            waiting += [child for child in ast.iter_child_nodes(node) if not isinstance(child, _INNER)]
+        sizes.append(size)
+    return sizes
+
+
+def swaps(node: ast.AST) -> bool:
+    """Is a node an assignment of several values to as many names?"""
+    return isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
+
+
+def test_a_statement_does_one_thing():
+    """As much of a syntax tree in each as in codebases that are pleasant to read, and half as much again."""
+    sizes = statements(map(ast.parse, SOURCES.values()))
+    tests = statements(ast.parse(file.read_text()) for file in (ROOT / "tests").rglob("*.py"))
+    assert max(sizes) <= 250
+    assert sum(sizes) / len(sizes) <= 9.5
+    assert sum(tests) / len(tests) <= 10.5
+
+
+@pytest.mark.parametrize(
+    ("is_one", "most"),
+    [
+        (lambda node: isinstance(node, ast.Lambda), 100),
+        (lambda node: isinstance(node, ast.NamedExpr), 15),
+        (lambda node: isinstance(node, ast.Name) and node.id == "Any", 550),
+        (swaps, 150),
+    ],
+    ids=["lambdas", "named expressions", "Any", "tuple assignments"],
+)
+def test_few_are(is_one, most):
+    assert sum(is_one(node) for text in SOURCES.values() for node in ast.walk(ast.parse(text))) <= most
+
+
+def test_the_formatter_lays_all_code_out():
+    assert [name for name, text in SOURCES.items() if "# fmt:" in text or "# ruff: noqa" in text] == []
+
+
 def test_these_checks_can_fail():
     edges = graph()
     assert "mrt_mitsuba.output.layers" in edges["mrt_mitsuba.rendering.plan"]
@@ -174,3 +223,6 @@ def test_these_checks_can_fail():
     text = f"def f({', '.join(f'a{i}' for i in range(9))}):\n    'Doc.'\n    # why\n\n    {body}"
     function = ast.parse(text).body[0]
     assert [measure(function, text) for measure in (lines_of_code, parameters, branches)] == [50, 9, 50]
+    packed = ast.parse("'Doc.'\na, b = f(1), 2\nif a:\n    g()")
+    assert statements([packed]) == [9, 2, 3]
+    assert [swaps(node) for node in packed.body] == [False, True, False]
