@@ -13,6 +13,7 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.plugins import is_known
 from mrt_mitsuba.plugins.snapshot import Part
 from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
 from mrt_mitsuba.rendering.settings import RenderSettings
@@ -105,6 +106,9 @@ class Prepared:
         whole = plan.region == plan.seen == (0, 0, *size) and plan.film in ("", "BoxFilter, rgb")
         traced = plan.kernel is not None and plan.variant == "llvm_ad_rgb"
         if not (plain and alone and whole and traced) or plan.layers or plan.motion:
+            return
+        sky = self._source.integrator.sky
+        if sky is not None and not all(map(is_known, mi.traverse(sky).hierarchy)):
             return
         self._state = None
         self._data = self._source.integrator.prepare(self._source.scene)

@@ -146,7 +146,9 @@ def set_level(loaded: mi.Scene, where: str, level: float) -> None:
     def holders(thing: Any) -> list[Any]:
         return [node for node in mi.traverse(thing).hierarchy if hasattr(type(node), "level")]
 
-    for node in [n for part in (loaded, *loaded.emitters()) for n in holders(part)]:
+    sky = loaded.integrator().sky
+    parts = [loaded, *loaded.emitters(), *([] if sky is None else [sky])]
+    for node in [n for part in parts for n in holders(part)]:
         {"instance": node.own, "class": type(node).shared, "module": LEVEL}[where][0] = level
 
 
@@ -198,6 +200,28 @@ def test_what_others_wrote_in_python_is_asked_each_time(variant, door, what, whe
         other = scene(**content)
         set_level(other, where, level)
         assert_array_equal(changed, render(other))
+        first = changed
+
+
+@pytest.mark.parametrize("where", ["instance", "class", "module"])
+@pytest.mark.parametrize("what", ["sky", "texture", "light"])
+def test_a_prepared_scene_asks_what_others_wrote_in_python(variant, what, where):
+    LEVEL[0] = 0.2
+    level: dict[str, Any] = {"type": foreign_light(where) if what == "light" else foreign_texture(where)}
+    content: dict[str, Any] = {"lamp0": {**level, "position": [0, 3, 4]}}
+    if what == "sky":
+        content = {"integrator": {"type": "mrt_whitted", "sky": level}}
+    elif what == "texture":
+        skin = {"type": "mrt_bsdf", "diffuse_reflectance": level}
+        content = {"ball": {"type": "sphere", "bsdf": skin}}
+    loaded = scene(**content)
+    again = mrt.prepare(loaded, aa=1, aamode="none")
+    first = again().image
+    for number in (0.4, 0.0):
+        set_level(loaded, where, number)
+        changed = again().image
+        assert_array_equal(changed, mrt.render(loaded, aa=1, aamode="none").image)
+        assert abs(changed - first).max() > 1e-2
         first = changed
 
 
