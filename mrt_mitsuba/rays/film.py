@@ -209,6 +209,16 @@ class Film:
         along = np.square(self.weights).mean() / np.square(self.weights.mean())
         return float(along / len(self.weights)) ** 2
 
+    @property
+    def stratified(self) -> float:
+        """Share of a pixel's variance that points which are even in each pixel can reduce.
+
+        A filter that varies in a pixel weighs values by their places, which are stratified with none of the
+        other dimensions; so its variance in pixels remains as that of independent points.
+        """
+        along = np.square(self.weights.mean(1)).sum() / np.square(self.weights).mean(1).sum()
+        return float(along) ** 2
+
     def spread_out(self, variance: np.ndarray) -> np.ndarray:
         """Return the variance [..., H, W] of pixels, up to a factor, given that of the rays in each."""
         share = np.square(self.weights).sum(axis=1)

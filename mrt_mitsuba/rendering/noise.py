@@ -213,7 +213,8 @@ class Halves(Stack):
         near = _near(own, WINDOWS[3:]) if near is None else near
         # where there is no noise near, all of the picture
         found, expected = np.moveaxis(near + 1e-3 * own.mean((-2, -1), keepdims=True), -3, 0)
-        return np.asarray(mixed * found / np.maximum(expected, 1e-30) * self.film.averaging)
+        ratio = 1 + self.film.stratified * (found / np.maximum(expected, 1e-30) - 1)
+        return np.asarray(mixed * ratio * self.film.averaging)
 
     def _around(self, values: np.ndarray) -> np.ndarray:
         """Return values [..., H, W], their means in windows, and the mean of all, [..., parts, H, W]."""
