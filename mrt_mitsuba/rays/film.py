@@ -210,12 +210,8 @@ class Film:
         return float(along / len(self.weights)) ** 2
 
     @property
-    def stratified(self) -> float:
-        """Share of a pixel's variance that points which are even in each pixel can reduce.
-
-        A filter that varies in a pixel weighs values by their places, which are stratified with none of the
-        other dimensions; so its variance in pixels remains as that of independent points.
-        """
+    def even(self) -> float:
+        """Share of a pixel's variance that is left of a filter which has its mean everywhere in a pixel."""
         along = np.square(self.weights.mean(1)).sum() / np.square(self.weights).mean(1).sum()
         return float(along) ** 2
 

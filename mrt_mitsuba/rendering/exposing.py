@@ -263,13 +263,15 @@ class Stack:
         return np.maximum(groups, near.reshape(groups.shape))
 
     @np.errstate(over="ignore")  # of light beyond float32, whose mean is infinite
-    def add(self, exposed: Canvas, chosen: np.ndarray) -> None:
-        """Add as many pictures of an exposure as there are ``chosen`` pixels for, [pictures, pixels]."""
-        rays = exposed.rays[: len(chosen)]
+    def add(self, exposed: Canvas, chosen: np.ndarray, first: int = 0) -> None:
+        """Add as many pictures of an exposure as there are ``chosen`` pixels for, [pictures, pixels], from
+        the ``first`` on."""
+        some = slice(first, first + len(chosen))
+        rays = exposed.rays[some]
         each = np.float32(1 / np.maximum(rays, 1))  # variance of a pixel's mean, up to a factor
         amount = self.rows(chosen) / self.film.spread_out(self.rows(each))
-        self.sums += amount * exposed.sums[:, : len(chosen)]
-        self.weights += amount * exposed.weights[: len(chosen)]
+        self.sums += amount * exposed.sums[: len(self.sums), some]
+        self.weights += amount * exposed.weights[some]
         self.amount += amount
         self.rays += rays
 

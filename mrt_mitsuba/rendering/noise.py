@@ -27,6 +27,8 @@ from mrt_mitsuba.rendering.exposing import Exposer, FilmStarts, Groups, Independ
 
 HALVES, SCOUTS = [0, 1], [2, 3]
 SUSPECT = 0.5  # shape of a tail where rare rays may rule
+MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too high
+MARGIN_FILTERED = 0.93  # where pixels share rays, and so no field can tell what another one takes
 EVENLY = 0.2  # of the pixels make up noise that is even
 TILE = 16  # pixels that round alike, under a filter: it has rays traced around all that need some
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
@@ -72,12 +74,14 @@ class Halves(Stack):
         film = exposer.film
         super().__init__(film, 2, len(exposer.names))
         self._exposer, self._seed, self._blurred = exposer, seed, blurred
+        self.margin = MARGIN_FILTERED if film.reach else MARGIN  #: of a target to aim at
         self._tile = TILE if film.reach else 1
         self._board = np.indices(film.shape).sum(0) % (1 if film.reach else self.fields)
         self._traced = np.zeros((4, film.pixels))
         self._total = np.zeros((3, 4, *film.shape), np.float32)
         self._square = np.zeros((4, *film.shape))  # mean of colours, as the next
         self._peak = np.zeros((4, *film.shape), np.float32)
+        self._scouts = Stack(film, 2, 3) if film.reach else None  # as the filter has them
         self._earlier: tuple[float, np.ndarray] | None = None
         self._bad, self._unfit = np.zeros(film.shape, bool), 0.0
 
@@ -117,6 +121,8 @@ class Halves(Stack):
         np.maximum(self._peak, peak, out=self._peak)
         with np.errstate(invalid="ignore"):
             self.add(exposed, chosen[:2] > 0)
+            if self._scouts:
+                self._scouts.add(exposed, chosen[2:] > 0, first=2)
 
     def unfit(self) -> str:
         """Return what radiance has no square in float32, and where; nothing if all has."""
@@ -213,8 +219,22 @@ class Halves(Stack):
         near = _near(own, WINDOWS[3:]) if near is None else near
         # where there is no noise near, all of the picture
         found, expected = np.moveaxis(near + 1e-3 * own.mean((-2, -1), keepdims=True), -3, 0)
-        ratio = 1 + self.film.stratified * (found / np.maximum(expected, 1e-30) - 1)
+        ratio = self.film.even * found / np.maximum(expected, 1e-30) + self._uneven()
         return np.asarray(mixed * ratio * self.film.averaging)
+
+    def _uneven(self) -> float:
+        """What the filter's change within a pixel adds to the ratio of a pixel's variance to that of
+        independent rays, as the scouts have it.
+
+        Values that depend on other dimensions gain nothing there by an even sequence, edges do.
+        """
+        if self._scouts is None:
+            return 0.0
+        rest = 1 - self.film.even
+        _, (found, expected) = _compared(self._gathered([2]), self._gathered([3]))
+        squares = np.where(self._unknown, 0, quarter_squares(*self._scouts.pictures()).mean(-1)).mean()
+        added = squares / self.film.averaging - self.film.even * found.mean()
+        return float(np.clip(added / max(expected.mean(), 1e-300), 0, rest))
 
     def _around(self, values: np.ndarray) -> np.ndarray:
         """Return values [..., H, W], their means in windows, and the mean of all, [..., parts, H, W]."""

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 GROWTH = 4.25  # times the rays there are may be there after another round: the error is known better then
-MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too high
 LEAST = 2**18  # rays that a target takes at least: fewer do not show what is rare
 LEAST_EVEN = 2**17  # where noise is even: fewer may miss what is rare in a small picture
 MORE = 2  # times the rays are doubled where the tail of their values is in doubt
@@ -69,16 +68,17 @@ def run_rounds(
             break
         # not asked for where all rays that are left are spent at once, whatever it says
         forecast = picture.forecast() if target or most < rays else None
+        aim = target and picture.margin * max(target, 1e-100)
         least = _least(picture, forecast, rays) if forecast and target else 0
         if now.spp < 0.9 * least:  # shares are rounded
             chosen = picture.next(forecast, min(most, least), rays, even=EVEN)
         elif forecast is None or target is None or forecast.rmse > target:
-            chosen = picture.next(forecast, most, rays, target and MARGIN * max(target, 1e-100))
+            chosen = picture.next(forecast, most, rays, aim)
         elif forecast.tail > DOUBTFUL and doubled < MORE:
             chosen = picture.next(forecast, min(most, 2 * now.spp), rays)
             doubled += 1
-        else:
-            break
+        else:  # the halves know better what is missing, if anything
+            chosen = picture.next(None, most, most, aim)
     error = replace(picture.error(), target=target)
     found = [picture.unfit(), _doubt(error), "" if stopped else _missed(goal, now, error)]
     if any(found):

@@ -89,7 +89,7 @@ def test_intervals_reach_farther_up_the_fewer_squares_there_are():
     assert ratios[2] == pytest.approx(1, abs=0.05)
 
 
-@pytest.mark.parametrize("rare", [0.0, 0.004, 0.02])
+@pytest.mark.parametrize("rare", [0.001, 0.004, 0.02])
 @pytest.mark.parametrize("rfilter", ["gaussian", "tent"])
 @pytest.mark.filterwarnings("ignore:a few rays rule the error")
 def test_once_a_half_has_decided_for_the_other_nothing_is_traced(rare, rfilter):

@@ -104,7 +104,10 @@ def test_no_value_decides_its_weight_nor_when_to_stop(half, color, goal):
     assert len(plain.rounds) > 1
     there = board == color
     assert_array_equal(changed.rays[half][there], plain.rays[half][there])
-    assert len(changed.rounds) == len(plain.rounds)
+    # a last round, which each half decides for the other, may be empty
+    before = min(len(changed.rounds), len(plain.rounds)) - 1
+    assert max(len(changed.rounds), len(plain.rounds)) <= before + 2
+    assert [r.spp for r in changed.rounds[:before]] == [r.spp for r in plain.rounds[:before]]
     assert np.ptp(plain.rays[half]) > 8  # and yet rays go where the noise is
 
 
