@@ -283,7 +283,8 @@ class Halves(Stack):
         so that no value moves its own weight. Before the last round, no pixel is taken for less noisy than
         ``even`` times the mean.
         """
-        room, self.last = most * self.film.pixels - self._traced.sum(), forecast is None or most >= rays
+        room = most * self.film.pixels - self._traced.sum()
+        self.last = forecast is None or most >= rays
         if forecast is not None and target is not None:
             deviation = np.sqrt(forecast.variance.ravel())
             wanted = np.maximum(deviation * deviation.mean() / (2 * target**2) - self.rays[0], 0)

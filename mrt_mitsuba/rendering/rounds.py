@@ -43,11 +43,17 @@ def run_rounds(
     Warns of a target that is not reached, and of an error that cannot be trusted. ``on_round`` is called
     after each round, and stops by returning False.
     """
-    start, done, spent, pixels = time.perf_counter(), list[Round](), 0, picture.film.pixels
-    rays, seconds, asked = goal.most, goal.seconds, goal.target
+    start = time.perf_counter()
+    done = list[Round]()
+    spent = 0
+    pixels = picture.film.pixels
+    rays = goal.most
+    seconds = goal.seconds
+    asked = goal.target
     target: float | None = None
     doubled = 0
-    chosen, stopped = picture.first(), False
+    chosen = picture.first()
+    stopped = False
     while cost := picture.cost(chosen):
         spent += cost
         with stage("rounds", cost, _message(done, target, cost / pixels)) as advance:
