@@ -25,6 +25,7 @@ GRACE = 1.0  # seconds; more than an orderly end takes without a kernel, and wel
 
 _handlers: dict[int, Callable[..., Any]] = {}  # of the signals that are held, as they were before
 _waiting: list[tuple[int, float]] = []  # signals, and when they came
+_holder = 0  # the thread in whose block they wait
 
 
 class Terminated(KeyboardInterrupt):
@@ -45,9 +46,11 @@ def held() -> Iterator[None]:
     A second one is heeded wherever it comes. A block inside another, or in a thread other than the main one,
     which gets no signals, changes nothing.
     """
+    global _holder
     if _handlers or threading.current_thread() is not threading.main_thread():
         yield
         return
+    _holder = threading.get_ident()
     try:
         for number in SIGNALS:
             if callable(handler := signal.getsignal(number)):
@@ -60,6 +63,18 @@ def held() -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
         heed(before)
+
+
+def _forked() -> None:
+    """Take back what a block does, in a process forked by another thread: there, it never ends."""
+    if threading.get_ident() != _holder:
+        for number, handler in _handlers.items():
+            signal.signal(number, handler)
+        _handlers.clear()
+        _waiting.clear()
+
+
+os.register_at_fork(after_in_child=_forked)
 
 
 def heed(handlers: dict[int, Callable[..., Any]] = _handlers) -> None:

@@ -241,6 +241,39 @@ def test_a_fork_during_a_render_does_not_inherit_its_lock(run_python):
     assert run_python(FORK).stdout.split() == ["7"]
 
 
+FORK_AND_INTERRUPT = """
+import os, signal, threading, time
+import mrt_mitsuba as mrt
+
+def work():
+    child = os.fork()
+    if child == 0:
+        try:
+            time.sleep(20)
+        except KeyboardInterrupt:
+            os._exit(7)
+        os._exit(1)
+    time.sleep(0.3)
+    os.kill(child, signal.SIGINT)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+
+def on_round(found):
+    if not started:
+        started.append(threading.Thread(target=work))
+        started[0].start()
+        started[0].join()
+
+started = []
+film = {"type": "hdrfilm", "width": 4, "height": 4}
+scene = {"type": "scene", "sky": {"type": "constant"}, "sensor": {"type": "perspective", "film": film}}
+mrt.render(scene, integrator="path", spp=16, aamode="noise", on_round=on_round, variant="scalar_rgb")
+"""
+
+
+def test_a_fork_during_a_render_does_not_inherit_that_signals_wait(run_python):
+    assert run_python(FORK_AND_INTERRUPT).stdout.split()[-1:] == ["7"]
+
+
 WRAPPERS = """
 import functools
 import mrt_mitsuba as mrt
