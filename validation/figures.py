@@ -75,7 +75,11 @@ def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
         row[0].set_ylabel(f"scene {scene}", **diagrams.WORDS)
         off = (difference.max(axis=-1) > 1 / 255).mean()
         rows.append(
-            {"scene": scene, "mean difference": float(difference.mean()), "off by > 1/255": float(off)}
+            {
+                "scene": scene,
+                "mean difference": float(difference.mean()),
+                "pixels off by > 1/255": f"{off:.2%}",
+            }
         )
     for axes, title in zip(plots[0], ("original", "ours", "|difference| × 100"), strict=True):
         axes.set_title(title, loc="left", **diagrams.WORDS)
@@ -85,7 +89,7 @@ def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
 def show_picture(axes: Any, picture: np.ndarray, tonemap: str = "report") -> None:
     """Show a linear picture [H, W, 3], by default as the report writes it."""
     axes.imshow(to_8bit(np.ascontiguousarray(picture, np.float32), tonemap), interpolation="nearest")
-    axes.set(xticks=[], yticks=[])
+    axes.set(xticks=[], yticks=[], anchor="N")
     axes.spines[:].set_visible(False)
 
 
@@ -110,7 +114,7 @@ def show_map(axes: Any, values: np.ndarray) -> None:
     ticks: Any = {"ticks": LogLocator(subs=(1, 2, 5)), "format": "%g"}
     bar = axes.figure.colorbar(shown, ax=axes, location="bottom", fraction=0.05, pad=0.02, **ticks)
     bar.minorticks_off()
-    axes.set(xticks=[], yticks=[])
+    axes.set(xticks=[], yticks=[], anchor="N")
     axes.spines[:].set_visible(False)
 
 

@@ -156,7 +156,7 @@ def choices(number: Number, cost: Cost = DOCS, progress: Progress | None = None)
 
 def advice(panels: Mapping[str, Findings]) -> list[Options]:
     """Rows that say what to use to get to an error, for each title of ``choices``."""
-    return [{"": title, **row} for title, found in panels.items() for row in found.advice()]
+    return [{"in": title, **row} for title, found in panels.items() for row in found.advice()]
 
 
 def title_of(number: Number) -> str:

@@ -194,7 +194,7 @@ def _draw_curves(axes: Axes, found: Findings) -> None:
         words = "within the reference's own error"
         axes.text(0.02, 0.01, words, transform=axes.transAxes, fontsize=LABELS - 1.5, color=GREY)
     seconds, errors = np.array([(p.seconds, _shown_error(p, bottom)) for p in found.points.values()]).T
-    axes.set_xlim(seconds.min() / 1.8, seconds.max() * 1.3)  # intervals may go on beyond
+    axes.set_xlim(seconds.min() / 2.5, seconds.max() * 1.3)  # intervals may go on beyond
     axes.set_ylim(0.8 * bottom, 1.6 * errors.max())
     for scale in (axes.xaxis, axes.yaxis):
         plain_numbers(scale)

@@ -288,7 +288,7 @@ def save_report(
 def notebook(study: Study, *, title: str) -> str:
     """The page of a study as a frame for a notebook, whose own style it leaves alone."""
     page = html.escape(_files([study], title)["index.html"].decode())
-    return f'<iframe srcdoc="{page}" style="width: 100%; height: 40rem; border: 0"></iframe>'
+    return f'<iframe srcdoc="{page}" style="width: 100%; height: 40rem; border: 1px solid #d5d8dd"></iframe>'
 
 
 def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[str, bytes]:

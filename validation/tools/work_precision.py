@@ -193,7 +193,8 @@ class Findings:
                 row |= {"use": low[0].name, "seconds": _shown(low[0].seconds, *low[0].seconds_interval)}
             if others:
                 times = others[0].seconds / low[0].seconds
-                row |= {"next best": others[0].name, "which takes": f"{times:.2g} times as long"}
+                longer = f"{times:.2g} times as long" if times > 1.05 else "as long"
+                row |= {"next best": others[0].name, "which takes": longer}
             rows.append(row)
         return rows
 
