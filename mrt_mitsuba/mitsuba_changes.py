@@ -205,9 +205,7 @@ def set_in_turn(setitem: Function, /, *args: object, **given: object) -> object:
     what="waits while such a scene is rendered, and notes what was updated",
     why="numbers may have been written where they lie, which no array shows",
 )
-def update_in_turn(
-    update: Function, /, *args: object, **given: object
-) -> list[tuple[mi.Object, set[str]]]:
+def update_in_turn(update: Function, /, *args: object, **given: object) -> list[tuple[mi.Object, set[str]]]:
     with one_at_a_time.lock:
         updated = update(*args, **given)
         parameters = _argument(0, "self", args, given)

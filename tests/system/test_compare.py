@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import Any
-
-import sys
 
 import numpy as np
 import OpenEXR
@@ -259,6 +258,8 @@ def test_wrong_renders_are_named(wrong, message):
 def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)  # as if it were not installed
     picture = np.zeros((4, 4, 3), np.float32)
-    with pytest.raises(mrt.MrtError, match=r"matplotlib is not installed: pip install 'mrt-mitsuba\[validation\]'"):
+    with pytest.raises(
+        mrt.MrtError, match=r"matplotlib is not installed: pip install 'mrt-mitsuba\[validation\]'"
+    ):
         mrt.compare(picture + 1, picture).save(tmp_path / "a.png")
     assert not list(tmp_path.iterdir())

@@ -114,7 +114,9 @@ def test_once_a_half_has_decided_for_the_other_nothing_is_traced(rare, rfilter):
     assert result.rounds[-1].spp < 16 / 1.05
 
 
-@pytest.mark.parametrize(("color", "luminance"), [((1, 0, 0), 0.2127), ((0, 1, 0), 0.7152), ((0, 0, 1), 0.0722)])
+@pytest.mark.parametrize(
+    ("color", "luminance"), [((1, 0, 0), 0.2127), ((0, 1, 0), 0.7152), ((0, 0, 1), 0.0722)]
+)
 def test_a_share_of_the_mean_luminance_sees_colours_as_srgb_does(color, luminance):
     """To which pilot rays are good by 1 % in this picture."""
     result = mrt.render(camera(64, 48), integrator=noise(color), target="20%", seed=1)

@@ -168,7 +168,7 @@ def test_functions_stay_within(measure, limit):
 
 
 def statements(trees: Iterable[ast.Module]) -> list[int]:
-    """The numbers of syntax nodes of all statements but docstrings, without those of statements inside them."""
+    """The numbers of syntax nodes of all statements but docstrings, without those of statements inside."""
     sizes = []
     for statement in (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.stmt)):
         if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
@@ -185,7 +185,11 @@ def statements(trees: Iterable[ast.Module]) -> list[int]:
 
 def swaps(node: ast.AST) -> bool:
     """Is a node an assignment of several values to as many names?"""
-    return isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
+    return (
+        isinstance(node, ast.Assign)
+        and isinstance(node.targets[0], ast.Tuple)
+        and isinstance(node.value, ast.Tuple)
+    )
 
 
 def test_a_statement_does_one_thing():
