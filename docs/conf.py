@@ -20,9 +20,9 @@ author = "mrt-mitsuba contributors"
 release = mrt_mitsuba.__version__
 built = ", ".join(f"{name} {version}" for name, version in versions().items())
 copyright = (  # at the foot of every page
-    f"{author}. What a page measures, it measured when it was built: {built}, {usable_cores()} cores, "
-    f"{platform.machine()}. Figures in its text are of version 0.1 with Mitsuba 3.9.1 on two cores of an "
-    "AMD EPYC"
+    f"{author}. Results of code were measured when this page was built: {built}, {usable_cores()} cores, "
+    f"{platform.machine()}. Figures in the text are from version 0.1 with Mitsuba 3.9.1 on two cores of an "
+    "AMD EPYC."
 )
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_math_renderer = "mathml"

@@ -109,9 +109,10 @@ def show_map(axes: Any, values: np.ndarray) -> None:
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import LogLocator
 
-    least, most = np.quantile(values[values > 0], (0.01, 1))
+    least, most = np.quantile(values[values > 0], (0.05, 1))
     shown = axes.imshow(np.maximum(values, least), cmap="viridis", norm=LogNorm(least, most))
-    ticks: Any = {"ticks": LogLocator(subs=(1, 2, 5)), "format": "%g"}
+    subs = (1, 2, 5) if most < 200 * least else (1,)
+    ticks: Any = {"ticks": LogLocator(subs=subs), "format": "%g"}
     bar = axes.figure.colorbar(shown, ax=axes, location="bottom", fraction=0.05, pad=0.02, **ticks)
     bar.minorticks_off()
     axes.set(xticks=[], yticks=[], anchor="N")

@@ -32,12 +32,14 @@ if TYPE_CHECKING:
 HERE = Path(__file__).parent
 
 
-# Leaves of a check's page the law of weights, and the bounds that do not hold
+# Leaves of a check's page the law of weights, below its bounds that do not hold
 CROP = """() => {
   for (const row of document.querySelectorAll("table.data tbody tr"))
     row.hidden = row.cells[0].innerText !== "weights";
   for (const row of document.querySelectorAll("table.bounds tbody tr"))
-    row.hidden = !row.querySelector(".bad");
+    row.hidden = !(row.matches(".bad, :has(.bad)") && row.innerText.includes("weights"));
+  const tables = document.querySelectorAll("section .wide");
+  tables[0].before(document.querySelector("section .wide:has(.bounds)"));
 }"""
 
 
@@ -65,7 +67,7 @@ def check(quick: bool) -> Image.Image:
         page.goto(f"file://{folder}/index.html")
         page.evaluate(CROP)
         top = page.locator("section").bounding_box()["y"] + 10
-        shot = page.screenshot(full_page=True, clip={"x": 0, "y": top, "width": 1180, "height": 560})
+        shot = page.screenshot(full_page=True, clip={"x": 0, "y": top, "width": 1180, "height": 800})
         browser.close()
     return Image.open(io.BytesIO(shot)).convert("RGB")
 

@@ -47,11 +47,12 @@ def panel(title: str, width: float = 5.0, height: float = 4.4) -> tuple[Figure, 
 
 
 def plain_numbers(scale: Any) -> None:
-    """Write decimal numbers at a logarithmic axis: 1, 2 and 5 of each decade, or 1 alone if it has many."""
+    """Write decimal numbers at a logarithmic axis: 1, 2 and 5 of each decade, fewer if it has many."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     least, most = scale.get_view_interval()
-    subs = (1, 2, 5) if most < 2e3 * least else (1,)
+    span = most / least
+    subs = (1, 2, 5) if span < 300 else (1, 3) if span < 1e4 else (1,)
     scale.set_major_locator(LogLocator(subs=subs))
     scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     scale.set_minor_locator(NullLocator())
