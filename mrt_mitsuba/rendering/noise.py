@@ -309,14 +309,15 @@ class Halves(Stack):
                 if near is not None:
                     variance = _calibrated(variance * each, halves[0], ~field) / each
                     gain = self._gain(~field, halves)
-                chosen[index] += self._share(
-                    index, variance, room / 2 * field.mean(), target, field, 0, gain
-                )
+                chosen[index] += self._share(index, variance, room / 2 * field.mean(), target, field, 0, gain)
         return chosen
 
     def _gain(self, among: np.ndarray, halves: np.ndarray) -> float:
-        """By what power of the rays, beyond the first, variance falls in some pixels [H, W], as the squares of
-        halves and what they are for independent rays have it, [2, H, W], now and a round before."""
+        """By what power of the rays, beyond the first, variance falls in some pixels [H, W].
+
+        ``halves``: their squares, and what these are for independent rays, [2, H, W]; the same is known of
+        the round before.
+        """
         if self._earlier is None:
             return 0.0
         rays, earlier = self._earlier

@@ -144,5 +144,10 @@ def _message(done: list[Round], target: float | None, more: float) -> str:
     """Return where a render stands before a round of so many rays a pixel."""
     if not done:
         return ""
-    aim = f" → {target:.2g}" if target else ""
-    return f"error {done[-1].rmse:.2g}{aim}, {done[-1].seconds:.0f} s, {more:.1f} rays a pixel more"
+    now = done[-1]
+    aim = left = ""
+    if target:
+        aim = f" → {target:.2g}"
+        seconds = now.seconds * max(min(now.rmse / target, 1e6) ** 2 - 1, 0)  # squares fall as time goes by
+        left = f", about {seconds:.0f} s left" if seconds < 1e6 else ""
+    return f"error {now.rmse:.2g}{aim}, {now.seconds:.0f} s{left}, {more:.1f} rays a pixel more"
