@@ -38,8 +38,14 @@ def divide(n: mi.UInt32, divisor: int) -> tuple[mi.UInt32, mi.UInt32]:
     return quotient, n - quotient * _data(variant, "UInt32", divisor)
 
 
-@lru_cache(maxsize=64)
 def _data(variant: str, kind: str, number: float) -> mi.Float:
+    # a kernel that dr.freeze records may read only what is made while it does
+    make = _array.__wrapped__ if dr.flag(dr.JitFlag.FreezingScope) else _array
+    return make(variant, kind, number)
+
+
+@lru_cache(maxsize=64)
+def _array(variant: str, kind: str, number: float) -> mi.Float:
     return dr.opaque(getattr(mi, kind), number)
 
 

@@ -310,9 +310,11 @@ class Exposer:
         ours = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
         self.names = self.own + ours
 
-    def lattice(self, places: Places, seed: Any) -> LatticeStarts:
-        """Return where the rays of a lattice start."""
+    def starts(self, places: Places, seed: Any) -> LatticeStarts | SceneStarts:
+        """Where the rays of a pass start; ``seed``: a number, or an array of one."""
         shader = self.shader
+        if self.film is not None:
+            return SceneStarts(self.film, seed, self.film.rays_near(places.size))
         random = shader.random or mi.is_spectral or shader.sensor.needs_aperture_sample()
         sampling = Independent(seed, opaque(places.size)) if random else None
         return LatticeStarts(places, shader.width, shader.height, sampling)

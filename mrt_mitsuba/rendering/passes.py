@@ -17,7 +17,7 @@ from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.film import Places, Region
-from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Means, SceneStarts, Stack
+from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Means, Stack
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
 from mrt_mitsuba.rendering.settings import DETECTORS, FILM
@@ -80,7 +80,7 @@ class Passes:
     def _trace(self, step: Pass) -> None:
         """Trace the samples of a lattice in all pixels: their means are new layers."""
         exposer = Exposer(self._job, self._shader, None, step.layers)
-        starts = exposer.lattice(self._placed(step, self._seed), self._seed)
+        starts = exposer.starts(self._placed(step, self._seed), self._seed)
         means = Means({name: self._flat(self._layer(name)) for name in exposer.layers}, step.places.size)
         with self._job.stage(step.name, len(self._pixels)) as advance:
             exposer.average(self._pixels, starts, means, advance)
@@ -94,7 +94,7 @@ class Passes:
         edge = np.flatnonzero(self.layers["samples"] > 1).astype(np.uint32)
         whole = isinstance(self._pixels, range)
         pixels = edge + np.uint32(self._pixels.start) if whole else self._pixels[edge]
-        starts = exposer.lattice(self._placed(step, self._seed), self._seed + 1)
+        starts = exposer.starts(self._placed(step, self._seed), self._seed + 1)
         layers = {name: self._flat(self.layers[name]) for name in exposer.layers}
         share = step.places.first, step.places.count  # samples there are, and further ones
         with self._job.stage(step.name, len(pixels)) as advance:
@@ -121,7 +121,7 @@ class Passes:
         marked[plan.seen.grown(film.reach, plan.width, plan.height).inside(whole)] = True
         pixels = np.flatnonzero(np.pad(marked, film.border, constant_values=True))
         stack = Stack(film, 1, len(exposer.names))
-        starts = SceneStarts(film, self._seed, rays)
+        starts = exposer.starts(step.places, self._seed)
         moments = "square" in step.layers
         with self._job.stage(step.name, len(pixels) * rays) as advance:
             exposed = exposer.expose(Groups(rays, pixels), starts, moments=moments, advance=advance)
@@ -142,7 +142,7 @@ class Passes:
         marked[self._seen] = self.layers["samples"][..., 0] > 1
         chosen = np.pad(marked, film.border).reshape(1, -1)
         pixels = np.flatnonzero(stack.widened(chosen)[0])
-        starts = SceneStarts(film, self._seed + 1, rays)
+        starts = exposer.starts(step.places, self._seed + 1)
         with self._job.stage(step.name, len(pixels) * rays) as advance:
             stack.add(exposer.expose(Groups(rays, pixels), starts, advance=advance), chosen)
         self._develop(exposer, stack.mean())

@@ -13,11 +13,12 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.plugins import is_known
 from mrt_mitsuba.plugins.snapshot import Part
+from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
-from mrt_mitsuba.rendering.settings import RenderSettings
-from mrt_mitsuba.rendering.shading import camera_matrices
+from mrt_mitsuba.rendering.exposing import Exposer
+from mrt_mitsuba.rendering.settings import FILM, RenderSettings
+from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 
 
 class Prepared:
@@ -28,8 +29,8 @@ class Prepared:
     """
 
     _source: Any = None  # the open scene
-    _data: Any = None  # of its kernels
     _state: Part | None = None  # of camera and integrator, for which the kernels were recorded
+    _exposer: Any = None  # whose kernels are recorded
     _launch: Any = None  # what launches them; None where nothing is recorded
 
     def __init__(self, scene: Any, options: dict[str, Any]) -> None:
@@ -49,13 +50,12 @@ class Prepared:
             self._resize()
             if self._launch is None:
                 return self._render(seed)
-            plan = self._data.plan
-            self._data = self._source.integrator.prepare(self._source.scene)
-            if self._data.plan != plan or self._look() is not self._state:
+            self._exposer.shader = shader = Shader(self._view, None)
+            plan = replace(self._made.plan, parts=shader.facts)
+            if shader.kernel != plan.kernel or self._look() is not self._state:
                 self._render(seed)
                 self._record()
                 return self._made
-            plan = replace(self._made.plan, parts=self._data.facts)
             options = {**self._made.options, "seed": seed}
             return replace(self._made, image=self._picture(seed), plan=plan, options=options)
 
@@ -78,10 +78,11 @@ class Prepared:
         with session(settings) as job:
             self._source = self._source or open_with(self._scene, settings, job)
             self._made = render_source(self._source, settings, job)
+            self._job = job
         return self._made
 
     def _look(self) -> Part:
-        """Return the state of the camera and the integrator, the same object if it is the same."""
+        """The state of the camera and the integrator, the same object if it is the same."""
         now = Part()
         settings = vars(self._source.integrator)
         now.add(self._source.sensor, ())
@@ -93,40 +94,43 @@ class Prepared:
         self._launch = None
         made = self._made
         plan = made.plan
+        first = plan.passes[0]
+        size = (plan.width, plan.height)
         sensor = self._source.sensor
-        film = sensor.film()
-        size = [plan.width, plan.height]
-        kinds = sensor.class_name(), sensor.sampler().class_name(), film.rfilter().class_name()
+        film = Film(sensor)
+        window = _window(sensor.film())
         plain = (
-            kinds == ("PerspectiveCamera", "IndependentSampler", "BoxFilter")
+            (sensor.class_name(), film.sampler) == ("PerspectiveCamera", "IndependentSampler")
+            and (film.rfilter, film.pixel_format) == ("BoxFilter", "rgb")
             and sensor.shutter_open_time() == 0
-            and (list(film.crop_size()) != size or list(film.size()) == size)
+            and (window[2:4] != size or window[:2] == size)  # else only a part of its film is seen
         )
-        alone = [step.layers for step in plan.passes] == [{"image"}] and plan.passes[0].places.size == 1
-        whole = plan.region == plan.seen == (0, 0, *size) and plan.film in ("", "BoxFilter, rgb")
+        alone = len(plan.passes) == 1 and first.layers == {"image"} and first.places.size == 1
+        whole = plan.region == plan.seen == (0, 0, *size)
         traced = plan.kernel is not None and plan.variant == "llvm_ad_rgb"
         if not (plain and alone and whole and traced) or plan.layers or plan.motion:
             return
-        sky = self._source.integrator.sky
-        if sky is not None and not all(map(is_known, mi.traverse(sky).hierarchy)):
-            return
-        self._state = None
-        self._data = self._source.integrator.prepare(self._source.scene)
-        if self._data.arrays(self._source.scene) is None:
-            return
-        self._state = self._look()
+        # A camera of its own, of the size of the picture
         clip = {"near_clip": sensor.near_clip(), "far_clip": sensor.far_clip()}
-        own_film = {"type": "hdrfilm", "width": plan.width, "height": plan.height}
-        self._sensor = mi.load_dict({"type": "perspective", **clip, "film": own_film})
-        own = mi.traverse(self._sensor)
+        own_film = {"type": "hdrfilm", "width": size[0], "height": size[1], "filter": {"type": "box"}}
+        view = mi.load_dict({"type": "perspective", **clip, "film": own_film})
+        own = mi.traverse(view)
         theirs = mi.traverse(sensor)
         names = "x_fov", "principal_point_offset_x", "principal_point_offset_y", "to_world"
         own.update({name: theirs[name] for name in names})
-        self._size = dr.opaque(mi.Vector2f, size)
-        self._made = replace(made, camera=camera_matrices(self._sensor))
+        self._view = replace(self._source, sensor=view)
+        shader = Shader(self._view, None)
+        if shader.read() is None:
+            return
+        self._state = None
+        self._state = self._look()
+        self._exposer = Exposer(
+            self._job, shader, shader.film if first.places.lattice == FILM else None, {"image"}
+        )
+        self._made = replace(made, camera=camera_matrices(view))
         # By a weak reference: in a ring, garbage collection would free recordings in the midst of another one
         me: Any = weakref.ref(self)
-        self._launch = dr.freeze(lambda seed, inputs: me()._trace(seed))
+        self._launch = dr.freeze(lambda seed, read: me()._trace(seed))
         try:
             same = all(np.array_equal(self._picture(made.options["seed"]), made.image) for _ in range(2))
         except RuntimeError:  # something else is read
@@ -134,26 +138,19 @@ class Prepared:
         self._launch = self._launch if same else None
 
     def _picture(self, seed: int) -> np.ndarray:
-        """Return the picture that the recorded kernels give."""
-        source = self._source
-        inputs = [self._data.arrays(source.scene), source.integrator.sky, self._sensor, self._size]
-        channels = self._launch(mi.UInt32(seed), inputs)
+        """The picture that the recorded kernels give."""
+        channels = self._launch(mi.UInt32(seed), self._exposer.shader.read())
         return np.stack([np.asarray(c) for c in channels], axis=-1).reshape(self._made.image.shape)
 
     def _trace(self, seed: Any) -> list[Any]:
-        """Return the channels along one ray of each pixel, at its centre or where the film's rules say."""
+        """The channels along one ray of each pixel."""
+        exposer = self._exposer
         plan = self._made.plan
-        offset = mi.Point2f(0.5)
+        starts = exposer.starts(plan.passes[0].places, seed)
         pixel = dr.arange(mi.UInt32, plan.width * plan.height)
-        if plan.film:
-            sampler = mi.load_dict({"type": "mrt_rays"})
-            sampler.start(seed, mi.UInt64(pixel))
-            offset = sampler.next_2d()
-        place = mi.Point2f(mi.Float(pixel % plan.width), mi.Float(pixel // plan.width)) + offset
-        time = mi.Float(self._sensor.shutter_open())
-        ray, weight = self._sensor.sample_ray(time, mi.Float(0), place / self._size, mi.Point2f(0.5))
-        traced = self._source.integrator.trace(self._source.scene, None, mi.Ray3f(ray), True, self._data)
-        return list(mi.Color3f(traced.radiance * mi.unpolarized_spectrum(weight)))
+        _, values = exposer.trace(pixel, mi.UInt32(0), starts)
+        (channels,) = values.values()
+        return channels
 
 
 def _window(film: mi.Film) -> tuple[int, ...]:

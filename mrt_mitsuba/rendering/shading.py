@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +12,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
-from mrt_mitsuba.plugins import plugin
+from mrt_mitsuba.plugins import is_known, plugin
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.plugins.parameters import ParameterError
 from mrt_mitsuba.plugins.variants import ByShape, text_of
@@ -158,6 +158,14 @@ class Shader:
         twice = sorted({name for name in self.aovs if self.aovs.count(name) > 1})
         if twice:
             raise SceneError(f"the integrator has several channels named {twice[0]}; name each differently")
+
+    def read(self) -> list[Any] | None:
+        """All that the kernels of ``values`` read; None where they may read anything."""
+        arrays = None if self._data is None else self._data.arrays(self.scene)
+        sky = getattr(self.integrator, "sky", None)
+        if arrays is None or (sky is not None and not all(map(is_known, mi.traverse(sky).hierarchy))):
+            return None
+        return [arrays, sky, self.sensor]
 
     def shift(self, time: mi.Float) -> mi.Vector3f:
         """Return the shift of the camera at a time."""
