@@ -162,8 +162,7 @@ def stated_and_true(
     axes.plot(span, span, color=diagrams.TEXT, linewidth=0.8)
     axes.fill_between(span, span / 3, span * 3, color="0.93", zorder=0)
     axes.set(xscale="log", yscale="log", xlim=span, ylim=span, xlabel="stated error", ylabel="true error")
-    for scale in (axes.xaxis, axes.yaxis):
-        diagrams.plain_numbers(scale)
+    diagrams.plain_numbers(axes)
     note: dict[str, Any] = {
         "fontsize": diagrams.LABELS,
         "color": diagrams.GREY,
