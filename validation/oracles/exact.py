@@ -7,7 +7,7 @@ of ``mp``. Vectors are triples and need not be normalised; the normal is +z.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from mpmath.ctx_mp import MPContext
 
@@ -77,6 +77,24 @@ def smith_g1(v: Number, alpha: Number) -> Number:
     if b >= mpf("1.6"):
         return mpf(1)
     return (mpf("3.535") * b + mpf("2.181") * b**2) / (1 + mpf("2.276") * b + mpf("2.577") * b**2)
+
+
+class Lobe(NamedTuple):
+    """The specular lobe without Fresnel, in exact numbers."""
+
+    tan2: Number  #: tan²θh
+    d: Number
+    g: Number  #: of both directions
+    value: Number  #: D G / (4 cos θi)
+
+
+def lobe(wi: Sequence[Number], wo: Sequence[Number], alpha: Number) -> Lobe:
+    """The lobe for directions above the surface, whose half vector is their sum as it is."""
+    x, y, z = (number(p) + number(q) for p, q in zip(wi, wo, strict=True))
+    tan2 = (x * x + y * y) / (z * z)
+    d = beckmann_d(1 / mp.sqrt(1 + tan2), alpha)
+    g = smith_g1(wi, alpha) * smith_g1(wo, alpha)
+    return Lobe(tan2, d, g, d * g / (4 * number(wi[2])))
 
 
 def visible_cos(v: Number, alpha: Number) -> Number:

@@ -24,25 +24,26 @@ def at_angle(degrees: float) -> Array:
     return np.array([np.sin(theta) * 0.8, np.sin(theta) * 0.6, np.cos(theta)])
 
 
+def mirrored(wi: Array, slope: Array, azimuth: Array) -> Array:
+    """The directions [N, 3] into which half vectors of these slopes and azimuths [N] mirror ``wi`` [N, 3]."""
+    m = np.stack([slope * np.cos(azimuth), slope * np.sin(azimuth), np.ones(len(wi))], axis=-1)
+    m /= np.linalg.norm(m, axis=-1, keepdims=True)
+    return np.asarray(2 * (wi * m).sum(axis=-1, keepdims=True) * m - wi)
+
+
 def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array]:
     """Pairs of random directions above the surface whose half vector lies within a slope of 4 alpha.
 
     Both cosines are at least 0.02. Beyond that slope the lobe is below e^-16 of its peak.
     """
     rng = np.random.default_rng(seed)
-    wi = np.empty((0, 3))
-    wo = np.empty((0, 3))
-    while len(wi) < count:
-        i = direction(rng.uniform(0.02, 1, 4 * count), rng.uniform(0, 2 * np.pi, 4 * count))
+    pairs = np.empty((2, 0, 3))
+    while pairs.shape[1] < count:
+        wi = direction(rng.uniform(0.02, 1, 4 * count), rng.uniform(0, 2 * np.pi, 4 * count))
         slope = alpha * 4 * np.sqrt(rng.random(4 * count))
-        psi = rng.uniform(0, 2 * np.pi, 4 * count)
-        m = np.stack([slope * np.cos(psi), slope * np.sin(psi), np.ones(4 * count)], axis=-1)
-        m /= np.linalg.norm(m, axis=-1, keepdims=True)
-        o = 2 * (i * m).sum(axis=-1, keepdims=True) * m - i
-        up = o[:, 2] > 0.02
-        wi = np.concatenate([wi, i[up]])
-        wo = np.concatenate([wo, o[up]])
-    return unit(wi[:count]), unit(wo[:count])
+        wo = mirrored(wi, slope, rng.uniform(0, 2 * np.pi, 4 * count))
+        pairs = np.concatenate([pairs, np.stack([wi, wo])[:, wo[:, 2] > 0.02]], axis=1)
+    return unit(pairs[0, :count]), unit(pairs[1, :count])
 
 
 def evaluate(bsdf: Any, wi: Array, wo: Array) -> list[Array]:

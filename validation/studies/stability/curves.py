@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import mitsuba as mi
@@ -20,7 +21,7 @@ from mrt_mitsuba.validation.studies.roughconductor import ours as lobe
 from mrt_mitsuba.validation.studies.roughconductor import theirs as other_lobe
 from mrt_mitsuba.validation.studies.stability.geometry import MIRROR, ROUNDING, ends, lit, trace_of
 from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.bsdf_probe import evaluate
+from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, mirrored
 from mrt_mitsuba.validation.tools.study import Study, Values
 
 if TYPE_CHECKING:
@@ -142,22 +143,15 @@ def _pairs(count: int, cosine: Array, alpha: float) -> tuple[Array, Array]:
     rng = np.random.default_rng(11)
     phi, psi = rng.uniform(0, 2 * np.pi, (2, count))
     wi = direction(cosine, phi)
-    slope = 2 * alpha * np.sqrt(rng.random(count))
-    m = unit(np.stack([slope * np.cos(psi), slope * np.sin(psi), np.ones(count)], axis=1))
-    wo = np.float32(2 * dot(wi, m)[:, None] * m - wi)
+    wo = np.float32(mirrored(wi, 2 * alpha * np.sqrt(rng.random(count)), psi))
     up = wo[:, 2] > 0
     return wi[up], wo[up]
 
 
 def _lobes(wi: Array, wo: Array, alpha: float) -> Curves:
     """The roundings of the lobe D G / (4 cos θi), without Fresnel."""
-    truth = []
     exactly = exact.number(np.float32(alpha))
-    for i, o in zip(wi, wo, strict=True):
-        x, y, z = (exact.number(p) + exact.number(q) for p, q in zip(i, o, strict=True))
-        cosine = 1 / exact.mp.sqrt(1 + (x * x + y * y) / (z * z))
-        shadowing = exact.smith_g1(i, exactly) * exact.smith_g1(o, exactly)
-        truth.append(float(exact.beckmann_d(cosine, exactly) * shadowing / (4 * exact.number(i[2]))))
+    truth = [exact.lobe(i, o, exactly).value for i, o in zip(wi, wo, strict=True)]
     lobes = {name: evaluate(mi.load_dict(of(alpha)), wi, wo)[0][:, 0] for name, of in BSDFS.items()}
     # as the report has it, of cosines alone, in float32
     a = np.float32(alpha)
@@ -165,7 +159,7 @@ def _lobes(wi: Array, wo: Array, alpha: float) -> Curves:
     d = np.exp((c**2 - 1) / (c**2 * a**2)) / (np.float32(np.pi) * a**2 * c**4)
     g = _first_g1(wi[:, 2], a) * _first_g1(wo[:, 2], a)
     lobes[FIRST] = d * g / (4 * wi[:, 2] * wo[:, 2]) * wo[:, 2]
-    return _off(lobes, np.array(truth))
+    return _off(lobes, np.array(truth, float))
 
 
 def _first_g1(cosine: Array, alpha: np.float32) -> Array:
@@ -245,12 +239,7 @@ def _quadratic(a: Array, b: Array, c: Array, holds: Callable[[Array], Array] = n
     return both.min(axis=0)
 
 
-def distant(far: float, count: int) -> Curves:
-    """Measure hits of a ball seen from so many radii."""
-    return sphere(1.0, count, far)
-
-
-def sphere(scale: float, count: int, far: float = 3.0) -> Curves:
+def ball(count: int, *, scale: float = 1.0, far: float = 3.0) -> Curves:
     """Measure hits of a ball of a scale seen from so many radii."""
     rng = np.random.default_rng(5)
     eyes = unit(rng.normal(size=(count, 3))) * scale * far
@@ -258,12 +247,13 @@ def sphere(scale: float, count: int, far: float = 3.0) -> Curves:
     o, d = _aimed(across * rng.uniform(0, 0.9, (count, 1)), eyes)
     r = np.float32(scale)
     first = _quadratic(dot(d, d), 2 * dot(o, d), dot(o, o) - r * r)
-    ball = Sphere((0, 0, 0), float(r), MIRROR)
+    radius = float(r)
 
     def distance(p: Array) -> Array:
-        return norm(p, axis=1) - ball.radius
+        return norm(p, axis=1) - radius
 
-    return _hits(ball, (o, d), distance, first, {"type": "sphere", "radius": ball.radius})
+    stock = {"type": "sphere", "radius": radius}
+    return _hits(Sphere((0, 0, 0), radius, MIRROR), (o, d), distance, first, stock)
 
 
 def floor(far: float, count: int) -> Curves:
@@ -282,48 +272,31 @@ def floor(far: float, count: int) -> Curves:
     return _hits(Plane(tuple(normal), 0.0, MIRROR), (o, d), distance, first, stock)
 
 
-def cone(slender: float, count: int) -> Curves:
-    """Measure hits on the side of a cone of so many radii of height."""
-    return _axial(Cone, slender, count)
+def axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curves:
+    """Measure hits on the side of a thing, so many radii high, on an axis aslant; its larger extent is 1.
 
-
-def cylinder(slender: float, count: int) -> Curves:
-    """Measure hits on the side of a cylinder of so many radii of height."""
-    return _axial(Cylinder, slender, count)
-
-
-def _axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curves:
-    """Measure hits on the side of a thing on an axis aslant, whose larger extent is 1."""
+    At a depth below the tip its radius is ``wide + slope * depth``.
+    """
     rng = np.random.default_rng(7)
     height = min(slender, 1.0)
     radius = min(1 / slender, 1.0)
-    axis = unit(np.subtract(*ends(1.0)))
-    tip = np.float32(height / 2 * axis).astype(np.float64)
+    tip = np.float32(height / 2 * unit(np.subtract(*ends(1.0)))).astype(np.float64)
     base = -tip
     along = unit(tip - base)
     height = float(norm(tip - base))
+    wide, slope = (0.0, radius / height) if kind is Cone else (radius, 0.0)
     outwards = unit(np.cross(along, rng.normal(size=(count, 3))))
-    down = rng.uniform(0.2, 0.8, (count, 1))
-    growth = down if kind is Cone else 1.0
-    targets = tip - down * height * along + radius * growth * outwards
-    normal = unit(height * outwards + radius * along) if kind is Cone else outwards
-    eyes = targets + 3 * unit(normal + 0.3 * rng.normal(size=(count, 3)))
-    rays = _aimed(targets, eyes)
+    depth = height * rng.uniform(0.2, 0.8, (count, 1))
+    targets = tip - depth * along + (wide + slope * depth) * outwards
+    normal = unit(outwards + slope * along)
+    rays = _aimed(targets, targets + 3 * unit(normal + 0.3 * rng.normal(size=(count, 3))))
 
     def distance(p: Array) -> Array:
         depth = (tip - p) @ along
         r = norm(p - tip + depth[:, None] * along, axis=1)
-        if kind is Cylinder:
-            return r - radius
-        return (r * height - depth * radius) / np.hypot(height, radius)
+        return (r - wide - slope * depth) / np.hypot(1, slope)
 
-    stock = None
-    slope = radius / height
-    wide = 0.0
-    if kind is Cylinder:
-        slope = 0.0
-        wide = radius
-        stock = {"type": "cylinder", "p0": base, "p1": tip, "radius": radius}
+    stock = {"type": "cylinder", "p0": base, "p1": tip, "radius": radius} if kind is Cylinder else None
     first = _first_side(rays, tip, along, np.float32(slope), np.float32(wide))
     thing = kind(tuple(tip.tolist()), tuple(base.tolist()), radius, MIRROR)
     return _hits(thing, rays, distance, first, stock)
@@ -349,13 +322,25 @@ def _first_side(rays: Rays, tip: Array, axis: Array, tangent: np.float32, r: np.
     return _quadratic(a, b, c, below_tip)  # one half of a double cone
 
 
+def of_scale(scale: float, count: int) -> Curves:
+    return ball(count, scale=scale)
+
+
+def of_distance(far: float, count: int) -> Curves:
+    return ball(count, far=far)
+
+
+LOBE = 2e-5 / ROUNDING
+HIT = 16
+cone = partial(axial, Cone)
+cylinder = partial(axial, Cylinder)
 AXES = (
-    Axis("value of a highlight", "roughness α", "roughconductor", (-5, 0), roughness, 2e-5 / ROUNDING),
+    Axis("value of a highlight", "roughness α", "roughconductor", (-5, 0), roughness, LOBE),
     Axis("Fresnel reflectance", "index of refraction − 1", "mi.fresnel", (-7, 8), index, 2e-6 / ROUNDING),
-    Axis("value of a highlight", "cosine of the light", "roughconductor", (-8, 0), grazing, 2e-5 / ROUNDING),
-    Axis("hit with a floor", "distance / height of the eye", "rectangle", (0, 6), floor, 16),
-    Axis("hit with a cone", "height / radius", "256-sided mesh", (-4, 4), cone, 16),
-    Axis("hit with a cylinder", "height / radius", "cylinder", (-4, 4), cylinder, 16),
-    Axis("hit with a ball", "scale of the scene", "sphere", (-6, 6), sphere, 16),
-    Axis("hit with a ball", "distance / radius", "sphere", (1, 5), distant, 16),
+    Axis("value of a highlight", "cosine of the light", "roughconductor", (-8, 0), grazing, LOBE),
+    Axis("hit with a floor", "distance / height of the eye", "rectangle", (0, 6), floor, HIT),
+    Axis("hit with a cone", "height / radius", "256-sided mesh", (-4, 4), cone, HIT),
+    Axis("hit with a cylinder", "height / radius", "cylinder", (-4, 4), cylinder, HIT),
+    Axis("hit with a ball", "scale of the scene", "sphere", (-6, 6), of_scale, HIT),
+    Axis("hit with a ball", "distance / radius", "sphere", (1, 5), of_distance, HIT),
 )

@@ -13,8 +13,8 @@ import numpy as np
 from mrt_mitsuba.plugins import fresnel, microfacet
 from mrt_mitsuba.plugins.quadric_kinds import Columns
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.oracles.reference import unit
 from mrt_mitsuba.validation.studies.stability.case import Case
+from mrt_mitsuba.validation.tools.bsdf_probe import mirrored
 
 # Of tan²θh / alpha², minus the logarithm of exp(-…): the lobe is at 1e-7 of its peak, and at 1e-20
 IN_BOUND, STEEPEST = -np.log([1e-7, 1e-20])
@@ -32,6 +32,10 @@ NOTE = (
     "say, and the half vector is their sum; the gradient's error is relative to the sum of the sizes of its "
     "terms, since their sum passes through zero."
 )
+
+# D; G; the value, which is the BSDF times cos θo; the density of visible normals; the derivative of the value
+# with respect to alpha; and the sum of the sizes of the terms of that derivative
+TRUTH = ("D", "G", "BSDF cos", "pdf", "gradient", "slope")
 
 Arrays = dict[str, np.ndarray]
 Cosine = Any  # an array of Dr.Jit's, of float32 or float64
@@ -147,49 +151,43 @@ def largest_error(formula: Callable[[Cosine], Cosine], stride: int) -> float:
 
 @cache
 def lobes_with_truth(count: int) -> Arrays:
-    """Return ``count`` pairs of directions, or a third more, above the surface, evenly on logarithmic scales.
+    """``count`` pairs of directions, or a third more, above the surface, evenly on logarithmic scales.
 
-    Of N pairs ``wi`` and ``wo`` [N, 3], ``alpha``, ``ior``, the ``steepness`` tan²θh / alpha², and what
-    ``_exact`` says of them.
+    By name, for N pairs: the directions ``wi`` and ``wo`` [N, 3], ``alpha``, ``ior``, the ``steepness``
+    tan²θh / alpha², and the exact values of ``TRUTH`` [N].
     """
     # a third of them points down
     rng = np.random.default_rng(2)
-    pairs = (2, 2 * count)
-    alpha = np.float32(10 ** rng.uniform(-8, 2, pairs[1]))
-    cosine = 10 ** rng.uniform(-7, 0, pairs[1])
-    tan = alpha * np.sqrt(STEEPEST * rng.random(pairs[1]) ** 2)
+    drawn = 2 * count
+    alpha = np.float32(10 ** rng.uniform(-8, 2, drawn))
+    cosine = 10 ** rng.uniform(-7, 0, drawn)
+    slope = alpha * np.sqrt(STEEPEST * rng.random(drawn) ** 2)
     sine = np.sqrt((1 - cosine) * (1 + cosine))
-    phi, psi = rng.uniform(0, 2 * np.pi, pairs)
+    phi, psi = rng.uniform(0, 2 * np.pi, (2, drawn))
     wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=1)
-    m = unit(np.stack([tan * np.cos(psi), tan * np.sin(psi), np.ones(pairs[1])], axis=1))
-    wo = np.float32(2 * (wi * m).sum(axis=1, keepdims=True) * m - wi)
+    wo = np.float32(mirrored(wi, slope, psi))
     wi = np.float32(wi)
     x, y, z = (np.float64(wi) + wo).T  # along the half vector
     steepness = (x**2 + y**2) / (z * alpha) ** 2
     keep = (wo[:, 2] > 5e-8) & (steepness < STEEPEST)
-    lobes = {"wi": wi, "wo": wo, "alpha": alpha, "ior": rng.choice(IORS, pairs[1]), "steepness": steepness}
-    lobes = {name: values[keep] for name, values in lobes.items()}
-    rows = [_exact(*pair) for pair in zip(*list(lobes.values())[:4], strict=True)]
-    names = ("D", "G", "BSDF cos", "pdf", "gradient", "slope")
-    return lobes | dict(zip(names, np.array(rows).T, strict=True))
+    pairs = {"wi": wi, "wo": wo, "alpha": alpha, "ior": rng.choice(IORS, drawn)}
+    pairs = {name: values[keep] for name, values in pairs.items()}
+    truth = np.array([_exact(*pair) for pair in zip(*pairs.values(), strict=True)])
+    return pairs | {"steepness": steepness[keep]} | dict(zip(TRUTH, truth.T, strict=True))
 
 
-def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> tuple[float, ...]:
-    """Return D, G, the value (BSDF times cos θo), the density of visible normals, the value's derivative with
-    respect to alpha, and the sum of the sizes of the terms of that derivative."""
+def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> list[float]:
+    """The values of ``TRUTH`` for a pair of directions."""
     a = exact.number(alpha)
-    step = exact.number(alpha) * exact.mpf("1e-20")
-    x, y, z = (exact.number(p) + exact.number(q) for p, q in zip(wi, wo, strict=True))
-    tan2 = (x * x + y * y) / (z * z)
+    step = a * exact.mpf("1e-20")
+    lobe = exact.lobe(wi, wo, a)
     # Components are not rounded again: the cosine between the directions is that of them made one unit long
     sides = zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)
-    f = exact.fresnel_dielectric(exact.mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2, 1, ior)
-    d = exact.beckmann_d(1 / exact.mp.sqrt(1 + tan2), a)
-    g = [exact.smith_g1(v, a) for v in (wi, wo)]
-    value = d * f * g[0] * g[1] / (4 * exact.number(wi[2]))
-    # Of the logarithms of D, 2 (tan²/alpha² - 1) / alpha, and of both G₁
-    slopes = [(exact.smith_g1(v, a + step) / g1 - 1) / step for v, g1 in zip((wi, wo), g, strict=True)]
-    terms = [2 * tan2 / a**3, -2 / a, *slopes]
-    density = d / (4 * exact.visible_cos(wi, a))
-    size = sum(map(abs, terms))
-    return tuple(map(float, (d, g[0] * g[1], value, density, value * sum(terms), value * size)))
+    half = exact.mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2
+    value = lobe.value * exact.fresnel_dielectric(half, 1, ior)
+    density = lobe.d / (4 * exact.visible_cos(wi, a))
+    # of the logarithms of D, 2 (tan²/alpha² - 1) / alpha, and of both G₁
+    slopes = [(exact.smith_g1(v, a + step) / exact.smith_g1(v, a) - 1) / step for v in (wi, wo)]
+    terms = [2 * lobe.tan2 / a**3, -2 / a, *slopes]
+    values = (lobe.d, lobe.g, value, density, value * sum(terms), value * sum(map(abs, terms)))
+    return [float(x) for x in values]
