@@ -24,7 +24,7 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.validation.tools import renders
-from mrt_mitsuba.validation.tools.study import in_turns, machine, prepare_folder, ratio_of, timed
+from mrt_mitsuba.validation.tools.study import in_turns, machine, prepare_folder, ratio, ratio_of
 
 START_GOAL = 1.7
 DEVICE_SIZES = (800, 600), (4096, 4096)
@@ -62,16 +62,14 @@ def rows(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
 def start(turns: int) -> Row:
     """The seconds of the command against those of a bare start, as after installation."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600, "env": environment}
 
-    def seconds(command: Sequence[str], turn: int) -> float:
-        return timed(partial(subprocess.run, [sys.executable, *command], **silent))[1]
+    def python(*arguments: str) -> partial[Any]:
+        silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600}
+        return partial(subprocess.run, [sys.executable, *arguments], env=environment, **silent)
 
     with tempfile.TemporaryDirectory() as folder:
-        commands = ("-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1"), ("-c", BARE)
-        sides = [partial(seconds, command) for command in commands]
-        in_turns(sides, 1)  # Python compiles modules once
-        return ratio_of(*in_turns(sides, turns)) | {"goal": START_GOAL}
+        command = python("-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1")
+        return ratio(command, python("-c", BARE), repeats=turns) | {"goal": START_GOAL}
 
 
 def cases(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:

@@ -69,14 +69,26 @@ def beckmann_d(cos_theta_h: Number, alpha: Number) -> Number:
     return mp.exp(-(1 / c**2 - 1) / a**2) / (mp.pi * a**2 * c**4)
 
 
-def smith_g1(v: Number, alpha: Number) -> Number:
-    """The rational fit of Walter et al. for a direction above the surface."""
+def steepness(v: Sequence[Number], alpha: Number) -> Number:
+    """1 / (alpha tan θ) of a direction above the surface, infinite along the normal."""
     x, y, z = map(number, v)
     across = number(alpha) * mp.sqrt(x * x + y * y)
-    b = z / across if across else mp.inf
+    return z / across if across else mp.inf
+
+
+def smith_g1(v: Sequence[Number], alpha: Number) -> Number:
+    """The rational fit of Walter et al. for a direction above the surface."""
+    b = steepness(v, alpha)
     if b >= mpf("1.6"):
         return mpf(1)
     return (mpf("3.535") * b + mpf("2.181") * b**2) / (1 + mpf("2.276") * b + mpf("2.577") * b**2)
+
+
+def visible_cos(v: Sequence[Number], alpha: Number) -> Number:
+    """(1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
+    a = steepness(v, alpha)
+    smith = (mp.exp(-a * a) / (a * mp.sqrt(mp.pi)) - mp.erfc(a)) / 2
+    return (1 + smith) * number(v[2])
 
 
 class Lobe(NamedTuple):
@@ -95,13 +107,3 @@ def lobe(wi: Sequence[Number], wo: Sequence[Number], alpha: Number) -> Lobe:
     d = beckmann_d(1 / mp.sqrt(1 + tan2), alpha)
     g = smith_g1(wi, alpha) * smith_g1(wo, alpha)
     return Lobe(tan2, d, g, d * g / (4 * number(wi[2])))
-
-
-def visible_cos(v: Number, alpha: Number) -> Number:
-    """(1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
-    x, y, z = map(number, v)
-    across = number(alpha) * mp.sqrt(x * x + y * y)
-    if across == 0:
-        return z
-    a = z / across
-    return z + (mp.exp(-a * a) * across / mp.sqrt(mp.pi) - z * mp.erfc(a)) / 2

@@ -9,10 +9,11 @@ that is below the rounding error of float32, a float32 detector may decide other
 
 from __future__ import annotations
 
-import math
+from itertools import product
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, sobel
+from scipy.special import comb
 
 Array = np.ndarray
 Edges = tuple[Array, Array, Array]
@@ -20,8 +21,7 @@ Edges = tuple[Array, Array, Array]
 
 def luma_edges(image: Array) -> Edges:
     """The contrast of ``√(0.299 R + 0.587 G + 0.114 B)`` in the 3×3 neighbourhood."""
-    red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
-    luma = np.sqrt(0.299 * red + 0.587 * green + 0.114 * blue)
+    luma = np.sqrt(np.float64(image) @ [0.299, 0.587, 0.114])
     largest = maximum_filter(luma, 3)
     contrast = largest - minimum_filter(luma, 3) + 0.05
     threshold = np.maximum(0.0312, 0.125 * largest)
@@ -34,8 +34,7 @@ def sobel_edges(image: Array) -> Edges:
     The margin is the distance of the nearest grey of the window, before truncation, from a whole number. Next
     to zero, where truncation goes to zero from both sides, it counts as far away.
     """
-    red, green, blue = np.moveaxis(np.asarray(image, dtype=np.float64), -1, 0)
-    exact = 255 * (0.07 * red + 0.72 * green + 0.21 * blue)
+    exact = 255 * (np.float64(image) @ [0.07, 0.72, 0.21])
     from_whole = np.where(abs(exact) < 0.5, 1.0, abs(exact - np.round(exact)))
     gradient = sum(abs(sobel(np.trunc(exact), axis)) for axis in (0, 1))
     return _inside(gradient > 0, gradient, minimum_filter(from_whole, 3))
@@ -49,12 +48,12 @@ def blur_amount(depth: Array, focal_distance: float, focal_range: float) -> Arra
 
 def gaussian_dof(image: Array, amount: Array) -> Array:
     """Blur with Pascal windows; ``amount`` as from ``blur_amount``, both with the top row first."""
-    buffer = np.asarray(image, dtype=np.float64)[::-1]  # row 0 at the bottom
+    buffer = np.float64(image)[::-1]  # row 0 at the bottom
     amount = amount[::-1]
     result = buffer.copy()
     for place in np.ndindex(amount.shape):
         k = int(amount[place])
-        pascal = np.array([math.comb(2 * k - 1, j) for j in range(2 * k)], float)
+        pascal = comb(2 * k - 1, np.arange(2 * k))
         window = tuple(slice(max(at - k, 0), at + k) for at in place)
         rows, columns = amount[window].shape  # cut off at the border; the weights begin with the first
         weight = np.outer(pascal[:rows], pascal[:columns]) * (amount[window] != 0)
@@ -76,29 +75,25 @@ def corrected_dof(image: Array, radius: Array) -> Array:
     level, spreads over its own disc; what is behind is seen through the pixel's, and in the same layer only
     through the narrower of both.
     """
-    steps = [(dx, dy) for dx in range(-5, 6) for dy in range(-5, 6)]
-    padded = np.pad(np.dstack([image, np.ones(radius.shape), radius]), ((5, 5), (5, 5), (0, 0)), mode="edge")
-    front, same, behind = np.zeros((3, *radius.shape, 4))
-
-    def disc(radius: Array, dx: int, dy: int) -> Array:
-        """The share of its light that a disc has in a pixel so far away."""
-        cover = [np.clip(radius + 1 - math.hypot(*step), 0, 1) for step in ((dx, dy), *steps)]
-        return (cover[0] / sum(cover[1:]))[..., None]
-
-    for dx, dy in steps:
-        there = padded[5 + dy : 5 + dy + len(radius), 5 + dx : 5 + dx + radius.shape[1]]
-        theirs = abs(there[..., 4])
-        light = there[..., :4]
-        order = there[..., 4] - radius
-        own_disc = disc(abs(radius), dx, dy)
-        their_disc = disc(theirs, dx, dy)
-        nearer = np.clip(-order, 0, 1)[..., None]
-        level = np.maximum(1 - abs(order), 0)[..., None]
-        farther = np.clip(order, 0, 1)[..., None]
-        wider_behind = ((order > 0) & (theirs > abs(radius)))[..., None]
-        front += nearer * their_disc * light
-        same += level * np.where(wider_behind, own_disc, their_disc) * light
-        behind += farther * own_disc * light
+    rows, columns = radius.shape
+    steps = list(product(range(-5, 6), repeat=2))
+    radii = np.pad(radius, 5, mode="edge")
+    picture = np.dstack([image, np.ones(radius.shape)])
+    picture = np.pad(picture, ((5, 5), (5, 5), (0, 0)), mode="edge")
+    # the share of its light that a disc has in each pixel around it [H + 10, W + 10, steps]
+    discs = np.clip(abs(radii)[..., None] + 1 - np.hypot(*np.transpose(steps)), 0, 1)
+    discs /= discs.sum(axis=-1, keepdims=True)
+    front, same, behind = np.zeros((3, rows, columns, 4))
+    for step, (dx, dy) in enumerate(steps):
+        there = np.s_[5 + dy : 5 + dy + rows, 5 + dx : 5 + dx + columns]
+        light = picture[there]
+        order = (radii[there] - radius)[..., None]
+        own_disc = discs[5:-5, 5:-5, step, None]
+        their_disc = discs[there][..., step, None]
+        wider_behind = (order > 0) & (abs(radii[there]) > abs(radius))[..., None]
+        front += np.clip(-order, 0, 1) * their_disc * light
+        same += np.maximum(1 - abs(order), 0) * np.where(wider_behind, own_disc, their_disc) * light
+        behind += np.clip(order, 0, 1) * own_disc * light
     hidden = np.minimum(front[..., 3:], 1)
     solid = np.minimum(same[..., 3:], 1)
     gap = np.minimum(1 - solid, behind[..., 3:])

@@ -53,22 +53,21 @@ def with_triangles(number: int, **size: Any) -> Nodes:
     cells = max(1, round((number / 2) ** 0.5))
     z, x = np.mgrid[-3 : 3 : (cells + 1) * 1j, -3 : 3 : (cells + 1) * 1j]
     positions = np.stack([x, 0.2 * np.sin(5 * x) * np.cos(7 * z), z], axis=-1).reshape(1, -1, 3)
-    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    first = np.stack([corner, corner + cells + 1, corner + 1], axis=1)
-    second = np.stack([corner + 1, corner + cells + 1, corner + cells + 2], axis=1)
-    faces = np.concatenate([first, second])[None].astype(np.uint32)
+    row = cells + 1  # vertices of a row
+    corners = (np.arange(cells)[:, None] * row + np.arange(cells)).reshape(-1, 1, 1)
+    faces = np.add(corners, [[0, row, 1], [1, row, row + 1]]).reshape(1, -1, 3)
     nodes = mrt.scene_dict(0, **size)
     nodes["plane_0"] = {
         "type": "mrt_mesh",
         "positions": mi.Bitmap(np.ascontiguousarray(positions, np.float32)),
-        "faces": mi.Bitmap(np.ascontiguousarray(faces)),
+        "faces": mi.Bitmap(faces.astype(np.uint32)),
         "bsdf": {"type": "ref", "id": "material_4"},
     }
     return nodes
 
 
 def crowd(number: int, kind: str, **size: Any) -> Nodes:
-    """Return the room of scene 4 with this many spheres, or cones of the same sizes in random directions.
+    """The room of scene 4 with this many spheres, or cones of the same sizes in random directions.
 
     With the kind "group", the spheres are a single shape.
     """
@@ -97,9 +96,13 @@ def of_scene(nodes: Callable[..., Nodes], size: tuple[int, int], options: Nodes)
     return partial(mrt.render, load(nodes(width=size[0], height=size[1])), **options)
 
 
+def _small() -> mi.Scene:
+    return load(mrt.scene_dict(3, **SMALL))
+
+
 def _with_update() -> Render:
     """A render of a loaded scene that changes a colour first."""
-    scene = load(mrt.scene_dict(3, **SMALL))
+    scene = _small()
     parameters = mi.traverse(scene)
     key = next(name for name in list(parameters.keys()) if name.endswith("diffuse_reflectance.value"))
 
@@ -112,16 +115,12 @@ def _with_update() -> Render:
 
 
 def _prepared() -> Render:
-    """A prepared render, or in versions without ``prepare`` a render of a loaded scene."""
-    scene = load(mrt.scene_dict(3, **SMALL))
-    prepare = getattr(mrt, "prepare", lambda scene, **options: partial(mrt.render, scene, **options))
-    render = prepare(scene, **ONE_RAY)
-    return render
+    return mrt.prepare(_small(), **ONE_RAY)
 
 
 def _by_mitsuba() -> Render:
-    """Return Mitsuba's own way to a picture by the scene's integrator, ``mrt_whitted``."""
-    scene = load(mrt.scene_dict(3, **SMALL))
+    """Mitsuba's own way to a picture by the scene's integrator, ``mrt_whitted``."""
+    scene = _small()
     return lambda: np.array(mi.render(scene, spp=1))
 
 

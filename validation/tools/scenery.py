@@ -5,8 +5,8 @@ The whole ones use Mitsuba's own lights, lenses, materials, filters and samplers
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
@@ -26,25 +26,33 @@ SPP = 64  # of the samplers of ``SCENES``
 
 def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scene:
     """A scene whose spheres and planes have other materials."""
-    parts: Node = {
-        kind: tuple(dataclasses.replace(t, material=change(t.material)) for t in getattr(scene, kind))
-        for kind in ("spheres", "planes")
-    }
-    return dataclasses.replace(scene, **parts)
+
+    def changed(things: Sequence[Any]) -> Any:
+        return tuple(replace(thing, material=change(thing.material)) for thing in things)
+
+    return replace(scene, spheres=changed(scene.spheres), planes=changed(scene.planes))
 
 
 def sensor(
-    origin: Point, target: Point, rfilter: str = "gaussian", sampler: str = "independent", **more: Any
+    origin: Point,
+    target: Point,
+    rfilter: str = "gaussian",
+    sampler: str = "independent",
+    *,
+    up: Sequence[float] = (0, 1, 0),
+    film: Node | None = None,
+    **more: Any,
 ) -> Node:
     """A camera with a film and a sampler."""
-    film = {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
+    common = {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
     return {
         "type": "perspective",
         "fov": 40,
-        "to_world": _to().look_at(origin, target, more.pop("up", [0, 1, 0])),
-        "film": film | more.pop("film", {}),
+        "to_world": _to().look_at(origin, target, up),
+        "film": common | (film or {}),
         "sampler": {"type": sampler, "sample_count": SPP},
-    } | more
+        **more,
+    }
 
 
 def ball_scene(bsdf: Node, *, size: int = 96) -> mi.Scene:
@@ -121,6 +129,11 @@ def _box() -> Node:
 def _lamp(center: Point, radius: float, radiance: float) -> Node:
     emitter = {"type": "area", "radiance": rgb(radiance)}
     return {"type": "sphere", "center": center, "radius": radius, "emitter": emitter}
+
+
+def _spot(intensity: Color) -> Node:
+    place = _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])
+    return {"type": "spot", "intensity": rgb(intensity), "cutoff_angle": 25, "to_world": place}
 
 
 def _sky(color: Color) -> Node:
@@ -217,13 +230,11 @@ def area_light() -> Node:
 
 @scene
 def spot() -> Node:
-    light = {"type": "spot", "intensity": rgb((40, 36, 30)), "cutoff_angle": 25}
-    light["to_world"] = _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])
     return dict(
         sensor=sensor([0, 3, 6], [0, 0.5, 0], "tent"),
         floor=_floor(_diffuse(0.7)),
         box={"type": "cube", "to_world": _to().translate([0, 0.5, 0]).scale(0.5)},
-        light=light,
+        light=_spot((40, 36, 30)),
     )
 
 
@@ -265,40 +276,46 @@ KINDS = ("calm", "texture", "lights", "gloss", "glass", "spot", "fog")
 
 def load_room(size: int, *, sampler: str = "independent", rfilter: str = "box", **others: Node) -> mi.Scene:
     """A matte ball on a floor under a lamp and a faint sky; ``others`` add nodes or replace these."""
-    film = {"width": size, "height": size}
+    view: Node = {"film": {"width": size, "height": size}}
+    if "medium" in others:
+        view["medium"] = others.pop("medium")
     nodes = {
+        "type": "scene",
         "integrator": {"type": "path"},
-        "sensor": sensor([0, 2, 5], [0, 0.6, 0], rfilter, sampler, film=film),
+        "sensor": sensor([0, 2, 5], [0, 0.6, 0], rfilter, sampler, **view),
         "floor": _floor(_diffuse(0.5)),
-        "ball": _ball([0, 0.9, 0], 0.8, _diffuse(0.5)),
+        "ball": _middle(_diffuse(0.5)),
         "lamp": _lamp([1.5, 4, 1], 0.8, 6.25),
         "sky": _sky(0.05),
     }
-    medium = others.pop("medium", None)
-    if medium is not None:
-        nodes["sensor"]["medium"] = medium
-    return mi.load_dict({"type": "scene"} | nodes | others)
+    return mi.load_dict(nodes | others)
+
+
+def _middle(bsdf: Node) -> Node:
+    """The ball in the middle of a room."""
+    return _ball([0, 0.9, 0], 0.8, bsdf)
 
 
 def load_kind(kind: str, size: int, sampler: str = "multijitter", rfilter: str = "box") -> mi.Scene:
     """A room with one of the ``KINDS`` of noise."""
-    others: Node = {"integrator": {"type": "path", "max_depth": 5}}
-    if kind == "texture":
-        others["floor"] = _floor(_checks(100))
-    elif kind == "lights":
-        places = np.random.default_rng(1).uniform([-3, 1, -3], [3, 3, 3], (30, 3)).tolist()
-        others |= {f"lamp{k}": _lamp(place, 0.05, 40) for k, place in enumerate(places)}
-    elif kind == "gloss":
-        others["floor"] = _floor({"type": "roughconductor", "alpha": 0.1})
-        others["ball"] = _ball([0, 0.9, 0], 0.8, {"type": "roughplastic", "alpha": 0.1})
-    elif kind == "glass":
-        others["ball"] = _ball([0, 0.9, 0], 0.8, {"type": "dielectric"})
-    elif kind == "spot":
-        place = _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])
-        others["lamp"] = {"type": "spot", "intensity": rgb(40), "cutoff_angle": 25, "to_world": place}
-    elif kind == "fog":
-        inside = {"type": "ref", "id": "fog"}
-        others["fog"] = {"type": "homogeneous", "id": "fog", "sigma_t": 0.15, "albedo": 0.8}
-        others["around"] = {"type": "sphere", "radius": 30, "bsdf": {"type": "null"}, "interior": inside}
-        others |= {"integrator": {"type": "volpath", "max_depth": 5}, "medium": inside}
-    return load_room(size, sampler=sampler, rfilter=rfilter, **others)
+    places = np.random.default_rng(1).uniform([-3, 1, -3], [3, 3, 3], (30, 3)).tolist()
+    inside = {"type": "ref", "id": "fog"}
+    kinds: dict[str, Node] = {
+        "calm": {},
+        "texture": {"floor": _chessboard(100)},
+        "lights": {f"lamp{k}": _lamp(place, 0.05, 40) for k, place in enumerate(places)},
+        "gloss": {
+            "floor": _floor({"type": "roughconductor", "alpha": 0.1}),
+            "ball": _middle({"type": "roughplastic", "alpha": 0.1}),
+        },
+        "glass": {"ball": _middle({"type": "dielectric"})},
+        "spot": {"lamp": _spot(40)},
+        "fog": {
+            "integrator": {"type": "volpath", "max_depth": 5},
+            "fog": {"type": "homogeneous", "id": "fog", "sigma_t": 0.15, "albedo": 0.8},
+            "around": {"type": "sphere", "radius": 30, "bsdf": {"type": "null"}, "interior": inside},
+            "medium": inside,
+        },
+    }
+    path = {"integrator": {"type": "path", "max_depth": 5}}
+    return load_room(size, sampler=sampler, rfilter=rfilter, **path | kinds[kind])

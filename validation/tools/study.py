@@ -61,7 +61,7 @@ class Bound:
 
     @property
     def verdict(self) -> str:
-        """Return "ok" or "MISSED"; for a goal "goal" (reached), "slower" or "open"."""
+        """One word: ok or MISSED; for a goal "goal" (reached), slower or open."""
         if self.interval is None:
             return "ok" if self.holds else "MISSED"
         low, high = self.interval
@@ -200,14 +200,14 @@ def in_turns(sides: Sequence[Callable[[int], Item]], turns: int) -> list[list[It
 
 
 def ratio_of(seconds: Sequence[float], others: Sequence[float]) -> dict[str, float]:
-    """Return the median "ratio" of pairs of seconds, its quartiles "low" and "high", and both medians."""
+    """The median "ratio" of pairs of seconds, its quartiles "low" and "high", and both medians."""
     low, middle, high = np.quantile(np.divide(seconds, others), (0.25, 0.5, 0.75)).tolist()
     medians = {"seconds": float(np.median(seconds)), "other_seconds": float(np.median(others))}
     return {"ratio": middle, "low": low, "high": high, **medians}
 
 
 def ratio(run: Run, other: Run, *, repeats: int) -> dict[str, float]:
-    """Compare two runs in turns, see ``ratio_of``. Both run once before, which compiles their kernels."""
+    """Compare two runs in turns, see ``ratio_of``. Both run once before, which compiles what there is."""
 
     def seconds(side: Run, turn: int) -> float:
         return timed(side)[1]

@@ -13,7 +13,6 @@ from mrt_mitsuba.validation.studies.stability.case import Case
 from mrt_mitsuba.validation.tools.study import Bound, Study
 
 TITLE = "Numerical stability on stiff and extreme cases"
-COLUMNS = ("case", "what", "why", "measured", "bound", "")
 
 
 class Part(NamedTuple):
@@ -41,13 +40,12 @@ def run(study: Study, *, quick: bool) -> None:
     for table, (title, cases, note) in study.each(TITLE, PARTS.items()):
         rows = []
         for case in cases(quick):
-            limit = "-"
-            verdict = "cannot hold"
-            if case.limit is not None:
-                name = f"{title}: {case.name}"
-                bound = Bound(name, float(case.measured), case.limit, case.at_most, case.why)
+            measured = float(case.measured)
+            row = {"case": case.name, "what": case.what, "why": case.why, "measured": measured}
+            if case.limit is None:
+                rows.append(row | {"bound": "-", "": "cannot hold"})
+            else:
+                bound = Bound(f"{title}: {case.name}", measured, case.limit, case.at_most, case.why)
                 study.bounds.append(bound)
-                limit = f"{bound.sign} {bound.limit:.3g}"
-                verdict = bound.verdict
-            rows.append((case.name, case.what, case.why, float(case.measured), limit, verdict))
-        study.table(table, title, COLUMNS, rows, note)
+                rows.append(row | {"bound": f"{bound.sign} {bound.limit:.3g}", "": bound.verdict})
+        study.records(table, title, rows, note)

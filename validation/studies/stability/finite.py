@@ -64,13 +64,11 @@ def blurs() -> Iterator[Case]:
     yield Case("huge ranges, blur", what, "means are finite", np.sum(~np.isfinite(found)), 0)
 
 
-def _edges(name: str, image: Array, depth: Array) -> tuple[Array, Array]:
-    """The values of a detector, and which pixels it marks."""
+def _marks(name: str, image: Array, depth: Array) -> filters.Edges:
+    """What a detector finds in a picture, or the one that looks at the geometry in the depth."""
     if name == "geometry":
-        edges = filters.geometry_edges(np.full_like(image, 3**-0.5), depth)
-    else:
-        edges = getattr(filters, f"{name}_edges")(image)
-    return np.asarray(edges.value), np.asarray(edges.mask)
+        return filters.geometry_edges(np.full_like(image, 3**-0.5), depth)
+    return getattr(filters, f"{name}_edges")(image)
 
 
 def detectors() -> Iterator[Case]:
@@ -81,14 +79,14 @@ def detectors() -> Iterator[Case]:
     huge = np.float32(10 ** rng.uniform(-38, 34, (20, 20, 3)) * rng.choice([-1, 1], (20, 20, 3)))
     far = np.float32(10 ** rng.uniform(-37, 37, (20, 20)))
     for name in DETECTORS:
-        wrong = np.isnan(_edges(name, huge, far)[0]).sum()
+        wrong = np.isnan(_marks(name, huge, far).value).sum()
         for value in (np.nan, np.inf):
             image = np.full((12, 10, 3), 0.5, np.float32)
             depth = np.full((12, 10), 3, np.float32)
             image[6, 5, 2] = value
             depth[6, 5] = np.nan  # an infinite depth is a miss
-            values, mask = _edges(name, image, depth)
-            wrong += (np.isinf(values) != expected).sum() + (~mask & expected).sum()
+            edges = _marks(name, image, depth)
+            wrong += (np.isinf(edges.value) != expected).sum() + (~np.asarray(edges.mask) & expected).sum()
         what = "pixels not marked in its 3×3, or marked elsewhere; NaN among the values of pictures to ±1e34"
         yield Case(f"nan or inf in a picture, huge ranges, {name}", what, "reported, and local", wrong, 0)
 

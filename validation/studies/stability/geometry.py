@@ -16,7 +16,7 @@ from numpy.linalg import norm
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.oracles.reference import Array, nearest, unit
+from mrt_mitsuba.validation.oracles.reference import Array, dot, nearest, unit
 from mrt_mitsuba.validation.studies.stability.case import Case
 from mrt_mitsuba.validation.tools.study import Values
 
@@ -71,38 +71,29 @@ PLACES = (
 WHERE = f"sizes 1e-6 … 1e6, from 1e-6 to {FARTHEST:g} sizes away and from inside"
 
 
-class Figures(NamedTuple):
-    """Of the rays at one size: the worst place, in roundings, and counts of rays."""
-
-    place: float
-    hits: float
-    mirror_rays: float
-    shadow_rays: float
-
-
 class Limit(NamedTuple):
-    """What a figure is, why it must be so, and the most that it may be."""
+    """What a figure of the rays at a size is, why it must be so, and the most that it may be."""
 
     what: str
     why: str
     most: float
 
 
-LIMITS = (  # of the figures, in their order
-    Limit(
+LIMITS = {  # by the name of the figure, in the order of ``measure``
+    "place": Limit(
         f"{WHERE}: worst distance error across the surface, in roundings of the largest coordinate",
         "what intersection and a ray's own t lose",
         16,
     ),
-    Limit(
+    "hits": Limit(
         f"rays that hit or miss wrongly, {OUTLINE} roundings and more off the outline, or find a distance, "
         "normal or colour that is no finite number",
         "the same",
         0,
     ),
-    Limit("mirror rays that meet the surface they leave", "they start off it", 0),
-    Limit("points that their own surface hides from a light above it", "the same", 0),
-)
+    "mirror rays": Limit("mirror rays that meet the surface they leave", "they start off it", 0),
+    "shadow rays": Limit("points that their own surface hides from a light above it", "the same", 0),
+}
 
 MIRROR = Material(1.5, 1.0, (1, 1, 1), (1, 1, 1))
 CORNERS = np.array([(-0.8, -0.5, 0.1), (0.9, -0.3, -0.2), (0.1, 0.9, 0.3)])
@@ -131,8 +122,8 @@ def cases(quick: bool) -> Iterator[Case]:
     for kind in solids(1):
         sizes = DECADES[::3] if quick else DECADES
         worst = np.max([measure(kind, size, count) for size in sizes], axis=0)
-        for name, limit, figure in zip(Figures._fields, LIMITS, worst, strict=True):
-            yield Case(f"{kind}, {name.replace('_', ' ')}", limit.what, limit.why, figure, limit.most)
+        for (name, limit), figure in zip(LIMITS.items(), worst, strict=True):
+            yield Case(f"{kind}, {name}", limit.what, limit.why, figure, limit.most)
     # Scene 2 shows the horizon, which a far plane can cut off
     for number in (0, 2, 3) if quick else range(5):
         scene = replace(report_scene(number), focal_distance=None)
@@ -173,52 +164,46 @@ def placed(scene: Scene, factor: float, sizes: float) -> Scene:
     )
 
 
-def measure(kind: str, size: float, count: int) -> Figures:
-    """The figures of rays at one size, from all distances."""
+def measure(kind: str, size: float, count: int) -> list[float]:
+    """The figures of rays at one size, from all distances: the worst place, and three counts of rays."""
     # None is on the surface
     distances = [1.5 * x if x == size else x for x in DECADES if x <= FARTHEST * size]
-    starts, ways = zip(*(_rays(size, x, count) for x in distances), strict=True)
-    o = np.concatenate(starts)  # [N, 3]
-    d = np.concatenate(ways)
+    o, d = np.concatenate([_rays(size, x, count) for x in distances], axis=1)  # [N, 3] each
     scale = np.maximum(np.repeat(distances, count), size)
     rounding = ROUNDING * scale / size  # of the largest coordinate, in sizes
     thing = solids(size)[kind]
     light = np.array([3.0, 5.0, 4.0]) * size
     # and another thing so small and far off that no ray meets it; rays may need the scene for their results
     aside = {"type": "sphere", "center": [1.7 * size] * 3, "radius": 1e-3 * size, "flip_normals": True}
-    scene = mi.load_dict(lit(kind, thing, light.tolist()) | {"aside": aside})
-    trace = trace_of(scene, o, d)
+    trace = trace_of(mi.load_dict(lit(kind, thing, light.tolist()) | {"aside": aside}), o, d)
     hit = np.array(trace.hit.found)
     direct = np.array(trace.direct[0])
-    n = np.array(trace.hit.si.n).T
     t = np.array(trace.hit.si.t, np.float64)
 
     length = norm(np.float64(d), axis=1)
     unit_d = d / length[:, None]
     distance, _, normal, *_ = nearest([thing], o, unit_d)
     # an object enlarged is the same as rays from nearer by
-    reach = OUTLINE * rounding[:, None]
-    in_larger = np.isfinite(nearest([thing], o / (1 + reach), unit_d)[0])
-    in_smaller = np.isfinite(nearest([thing], o / (1 - reach), unit_d)[0])
+    reach = OUTLINE * rounding
+    nearer, farther = (nearest([thing], o / (1 + r)[:, None], unit_d)[0] for r in (reach, -reach))
     exists = np.isfinite(distance)
     both = hit & exists
-    cosine = np.where(both, (normal * d).sum(axis=1), 1)
+    cosine = np.where(both, dot(normal, d), 1)
     away = np.where(both, distance / length, 0)
     p = o + away[:, None] * d
     front = both & (cosine < -FLATTEST)
-    to_light = light - p
-    height = (to_light * normal).sum(axis=1) / norm(to_light, axis=1)
+    height = dot(unit(light - p), normal)
     largest = np.maximum(scale, abs(p).max(axis=1))
     across = abs((np.where(both, t, 0) - away) * cosine) / largest
-    finite = np.isfinite(direct) & (~hit | np.isfinite(n).all(axis=1) & np.isfinite(t))
-    wrong = (hit != exists) & (in_larger == in_smaller)
-    above = height > FLATTEST + OUTLINE * rounding
-    return Figures(
-        place=across.max() / ROUNDING if both.sum() >= 100 else np.inf,  # else it means nothing
-        hits=(wrong | ~finite).sum(),
-        mirror_rays=(front & (np.array(trace.bounces) > 1)).sum(),
-        shadow_rays=(front & above & ~(direct > 0)).sum(),
-    )
+    finite = np.isfinite(direct) & (~hit | np.isfinite(trace.hit.si.n).all(axis=0) & np.isfinite(t))
+    wrong = (hit != exists) & (np.isfinite(nearer) == np.isfinite(farther))
+    above = height > FLATTEST + reach
+    return [
+        across.max() / ROUNDING if both.sum() >= 100 else np.inf,  # else it means nothing
+        (wrong | ~finite).sum(),
+        (front & (np.array(trace.bounces) > 1)).sum(),
+        (front & above & ~(direct > 0)).sum(),
+    ]
 
 
 def lit(kind: str, thing: Any, light: Sequence[float]) -> Values:
