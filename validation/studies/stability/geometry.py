@@ -173,9 +173,10 @@ def measure(kind: str, size: float, count: int) -> list[float]:
     rounding = ROUNDING * scale / size  # of the largest coordinate, in sizes
     thing = solids(size)[kind]
     light = np.array([3.0, 5.0, 4.0]) * size
-    # and another thing so small and far off that no ray meets it; rays may need the scene for their results
+    # and another thing so small and far off that no ray meets it
     aside = {"type": "sphere", "center": [1.7 * size] * 3, "radius": 1e-3 * size, "flip_normals": True}
-    trace = trace_of(mi.load_dict(lit(kind, thing, light.tolist()) | {"aside": aside}), o, d)
+    scene = mi.load_dict(lit(kind, thing, light.tolist()) | {"aside": aside})
+    trace = trace_of(scene, o, d)  # arrays that are read below, from a scene that must still be there
     hit = np.array(trace.hit.found)
     direct = np.array(trace.direct[0])
     t = np.array(trace.hit.si.t, np.float64)
