@@ -19,6 +19,7 @@ from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render
 from mrt_mitsuba.rendering.exposing import Exposer
 from mrt_mitsuba.rendering.settings import FILM, RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
+from mrt_mitsuba.scene.open import opened
 
 
 class Prepared:
@@ -69,7 +70,9 @@ class Prepared:
                 "the film has another size or crop window than before, but width or height was given to "
                 "prepare: leave them out there, or call prepare with others"
             )
-        self._source = replace(self._source, width=window[2], height=window[3])
+        source = self._source
+        now = opened(source.name, source.scene, source.sensor, source.integrator)
+        self._source = replace(source, width=now.width, height=now.height)
         self._film_window = window
 
     def _render(self, seed: int) -> Result:

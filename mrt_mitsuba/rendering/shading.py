@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from mrt_mitsuba.plugins.whitted import Trace
 
 
+OF_FILMS = "RGBAW"  # channels of their own, a letter each
+
+
 class RayValues:
     """Values along camera rays, for the rows of the table of layers; what no row reads costs nothing.
 
@@ -155,9 +158,14 @@ class Shader:
             # Mitsuba would crash in a sample of stokes, also inside another
             self.layers = frozenset()
         self.aovs = tuple(integrator.aov_names())  #: names of the integrator's own channels
-        twice = sorted({name for name in self.aovs if self.aovs.count(name) > 1})
-        if twice:
-            raise SceneError(f"the integrator has several channels named {twice[0]}; name each differently")
+        names = [*OF_FILMS, *self.aovs]
+        twice = sorted({name for name in self.aovs if names.count(name) > 1})
+        if twice:  # Mitsuba's films refuse them, too
+            raise SceneError(
+                f"the integrator has several channels named {twice[0]}; name each differently"
+                if twice[0] not in OF_FILMS
+                else f"the integrator has a channel named {twice[0]}, as films have; name it differently"
+            )
 
     def read(self) -> list[Any] | None:
         """All that the kernels of ``values`` read; None where they may read anything."""

@@ -167,6 +167,22 @@ def test_a_prepared_scene_follows_the_size_of_its_film(variant, options, change)
     assert_array_equal(again(seed=3).image, mrt.render(scene, seed=3, **options).image)
 
 
+@pytest.mark.parametrize("change", [{"size": [0, 0]}, {"size": [9, 0]}, {"crop_size": [0, 3]}], ids=str)
+def test_a_prepared_scene_refuses_a_film_without_pixels(variant, change):
+    """The message spoke of a region, which nobody had given."""
+    nodes = {"type": "scene", "sky": {"type": "constant"}, "eye": sensor([0, 1, 6], [0, 0, 0], (16, 12))}
+    again = mrt.prepare(mi.load_dict(nodes), aa=1, aamode="none")
+    before = again().image
+    known = {name: list(again.params[f"eye.film.{name}"]) for name in ("size", "crop_size")}
+    for name, value in change.items():
+        again.params[f"eye.film.{name}"] = value
+    with pytest.raises(mrt.SceneError, match="give it one pixel at least"):
+        again()
+    for name, value in known.items():
+        again.params[f"eye.film.{name}"] = value
+    assert_array_equal(again().image, before)
+
+
 def test_a_size_of_the_film_and_one_by_option_contradict_each_other(variant):
     scene = mi.load_dict(mrt.scene_dict(3))
     again = mrt.prepare(scene, width=16, height=12, aa=1, aamode="none")

@@ -94,6 +94,14 @@ def test_channels_of_one_name_are_refused(aovs, options):
         mrt.render(scene(inner), **options)
 
 
+@pytest.mark.parametrize("options", [{}, *OPTIONS], ids=str)
+@pytest.mark.parametrize("name", "RGBAW")
+def test_channels_named_like_those_of_a_film_are_refused(name, options):
+    """A film's alpha was lost, and in a file such a channel; Mitsuba's films refuse them."""
+    with pytest.raises(mrt.MrtError, match=f"a channel named {name}, as films have; name it differently"):
+        mrt.render(scene(of_the_user(f"a {name}")), **options)
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb", "scalar_spectral"], indirect=True)
 @pytest.mark.parametrize("name", ["error", "samples", "d"])
 def test_mrt_adaptive_around_aov(variant, name):
