@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from inspect import Parameter, Signature
@@ -222,25 +222,24 @@ def _frames(
 ) -> tuple[dict[str, np.ndarray], ErrorEstimate | None, Sequence[Round]]:
     """Trace the plan's frames: the mean of their layers in the region, [H, W, channels] each; and the
     error and the rounds of the last frame.
+
+    Layers that are no averages are those of the first frame.
     """
     total = dict[str, np.ndarray]()
+    averaged = set[str]()
     for frame in range(plan.frames):
         passes = Passes(job, shader, plan, frame)
         layers = passes.run()
         if frame == 0:
             total = layers
+            averaged = {n for n in layers if n not in LAYER_TABLE or LAYER_TABLE[n].source == AVERAGED}
             continue
-        for name in _averaged(layers):
+        for name in averaged:
             total[name] += layers[name]
-    for name in _averaged(total) if plan.frames > 1 else ():
+    for name in averaged if plan.frames > 1 else ():
         total[name] /= np.float32(plan.frames)
     inside = plan.region.inside(plan.seen)
     return {name: values[inside] for name, values in total.items()}, passes.error, passes.rounds
-
-
-def _averaged(layers: Iterable[str]) -> list[str]:
-    """The layers that are averaged over frames; of the others, those of the first frame stay."""
-    return [name for name in layers if name not in LAYER_TABLE or LAYER_TABLE[name].source == AVERAGED]
 
 
 def _channels(layers: Mapping[str, np.ndarray], plan: Plan) -> dict[str, Image]:

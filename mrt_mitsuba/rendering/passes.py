@@ -16,7 +16,7 @@ from mrt_mitsuba import filters
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
 from mrt_mitsuba.output.layers import TABLE
-from mrt_mitsuba.rays.film import Places, Region
+from mrt_mitsuba.rays.film import Region
 from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Means, Stack
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
@@ -50,102 +50,81 @@ class Passes:
 
     def run(self) -> dict[str, np.ndarray]:
         """Run the passes of the plan; return the layers."""
-        stack: Any = None  # of what a film has been exposed to
+        stack: Stack | None = None  # of what a film has been exposed to
         for step in self._plan.passes:
-            on_film = step.places.lattice == FILM
-            if isinstance(step, Edges):
+            if isinstance(step, Edges | Blur):
                 with self._job.stage(step.name, len(self._pixels)) as advance:
-                    self._detect(step.detector, advance)
-            elif isinstance(step, Blur):
-                with self._job.stage(step.name, len(self._pixels)) as advance:
-                    self._blur(self.layers["image"], step, advance, "blur" in self._plan.layers)
+                    if isinstance(step, Edges):
+                        self._detect(step.detector, advance)
+                    else:
+                        self._blur(self.layers["image"], step, advance, "blur" in self._plan.layers)
             elif isinstance(step, Rounds):
                 self._run_rounds(step)
-            elif on_film and not self._shader.layers:
-                self._expose_whole(step)
-            elif on_film and isinstance(step, Refinement):
-                self._expose_edges(step, stack)
-            elif on_film:
-                stack = self._expose(step)
-            elif isinstance(step, Refinement):
-                self._trace_edges(step)
-            else:
+            elif step.places.lattice != FILM:
                 self._trace(step)
+            elif self._plan.whole:
+                self._expose_whole(step)
+            else:
+                stack = self._expose(step, stack)
         if "samples" in self._plan.layers and "samples" not in self.layers:
             self._layer("samples")[:] = self._plan.samples
         return self.layers
 
-    # ------------------------------------------- Lattices -------------------------------------------
+    # ------------------------------------------ Rays of a pass --------------------------------------
 
     def _trace(self, step: Pass) -> None:
-        """Trace the samples of a lattice in all pixels: their means are new layers."""
+        """Trace samples of a lattice: their means are new layers or, at edges, are averaged with these."""
+        places = replace(step.places, seed=self._seed)
+        if self._phase is not None:
+            places = replace(places, phase=self._phase)
         exposer = Exposer(self._job, self._shader, None, step.layers)
-        starts = exposer.starts(self._placed(step, self._seed), self._seed)
-        means = Means({name: self._flat(self._layer(name)) for name in exposer.layers}, step.places.size)
-        with self._job.stage(step.name, len(self._pixels)) as advance:
-            exposer.average(self._pixels, starts, means, advance)
+        pixels = self._pixels
+        edge = None
+        seed = self._seed
+        if isinstance(step, Refinement):
+            edge = np.flatnonzero(self.layers["samples"] > 1).astype(np.uint32)
+            pixels = edge + np.uint32(pixels.start) if isinstance(pixels, range) else pixels[edge]
+            seed += 1
+        layers = {}
+        for name in exposer.layers:
+            layer = self._layer(name) if edge is None else self.layers[name]
+            layers[name] = layer.reshape(len(self._pixels), -1)
+        means = Means(layers, places.size, edge, (places.first, places.count))
+        with self._job.stage(step.name, len(pixels)) as advance:
+            exposer.average(pixels, exposer.starts(places, seed), means, advance)
         if "square" in step.layers:
             variance = np.maximum(self.layers["square"] - self.layers["image"] ** 2, 0)
-            self.layers["square"] = variance / (step.places.size - 1)  # of the means
+            self.layers["square"] = variance / (places.size - 1)  # of the means
 
-    def _trace_edges(self, step: Pass) -> None:
-        """Trace the further samples of a lattice in pixels at edges, for their means over all samples."""
-        exposer = Exposer(self._job, self._shader, None, step.layers)
-        edge = np.flatnonzero(self.layers["samples"] > 1).astype(np.uint32)
-        whole = isinstance(self._pixels, range)
-        pixels = edge + np.uint32(self._pixels.start) if whole else self._pixels[edge]
-        starts = exposer.starts(self._placed(step, self._seed), self._seed + 1)
-        layers = {name: self._flat(self.layers[name]) for name in exposer.layers}
-        share = step.places.first, step.places.count  # samples there are, and further ones
-        with self._job.stage(step.name, len(pixels)) as advance:
-            exposer.average(pixels, starts, Means(layers, step.places.size, edge, share), advance)
-
-    def _placed(self, step: Pass, seed: int) -> Places:
-        """The places of a pass in the frame."""
-        phase = step.places.phase if self._phase is None else self._phase
-        return replace(step.places, seed=seed, phase=phase)
-
-    def _flat(self, layer: np.ndarray) -> np.ndarray:
-        """A view [pixels, channels] of a layer."""
-        return layer.reshape(len(self._pixels), -1)
-
-    # --------------------------------------------- Films --------------------------------------------
-
-    def _expose(self, step: Pass) -> Stack:
-        """Expose every pixel alike, as far as it reaches what is seen."""
+    def _expose(self, step: Pass, stack: Stack | None) -> Stack:
+        """Expose the pixels of a film that reach what is seen or, on top of a ``stack``, those at edges."""
         film, plan = self._shader.film, self._plan
         exposer = Exposer(self._job, self._shader, film, step.layers)
         rays = film.rays_near(step.places.size)
+        seed = self._seed
         marked = np.zeros((plan.height, plan.width), bool)
-        whole = Region(0, 0, plan.width, plan.height)
-        marked[plan.seen.grown(film.reach, plan.width, plan.height).inside(whole)] = True
-        pixels = np.flatnonzero(np.pad(marked, film.border, constant_values=True))
-        stack = Stack(film, 1, len(exposer.names))
-        starts = exposer.starts(step.places, self._seed)
+        if stack is None:
+            stack = Stack(film, 1, len(exposer.names))
+            whole = Region(0, 0, plan.width, plan.height)
+            marked[plan.seen.grown(film.reach, plan.width, plan.height).inside(whole)] = True
+            pixels = np.flatnonzero(np.pad(marked, film.border, constant_values=True))
+            chosen = np.ones((1, film.pixels), bool)
+        else:
+            marked[self._seen] = self.layers["samples"][..., 0] > 1
+            chosen = np.pad(marked, film.border).reshape(1, -1)
+            pixels = np.flatnonzero(stack.widened(chosen)[0])
+            seed += 1
+        starts = exposer.starts(step.places, seed)
         moments = "square" in step.layers
         with self._job.stage(step.name, len(pixels) * rays) as advance:
             exposed = exposer.expose(Groups(rays, pixels), starts, moments=moments, advance=advance)
-            stack.add(exposed, np.ones((1, film.pixels), bool))
+            stack.add(exposed, chosen)
         if moments:
             square = exposed.square[:, 0] / rays - (exposed.total[:, 0] / rays) ** 2
             variance = np.maximum(square, 0) / (rays - 1) * film.averaging
             self._layer("square")[:] = film.picture(np.moveaxis(variance, 0, -1))[self._seen]
         self._develop(exposer, stack.mean())
         return stack
-
-    def _expose_edges(self, step: Pass, stack: Stack) -> None:
-        """Expose pixels at edges further."""
-        film, plan = self._shader.film, self._plan
-        exposer = Exposer(self._job, self._shader, film, step.layers)
-        rays = film.rays_near(step.places.size)
-        marked = np.zeros((plan.height, plan.width), bool)
-        marked[self._seen] = self.layers["samples"][..., 0] > 1
-        chosen = np.pad(marked, film.border).reshape(1, -1)
-        pixels = np.flatnonzero(stack.widened(chosen)[0])
-        starts = exposer.starts(step.places, self._seed + 1)
-        with self._job.stage(step.name, len(pixels) * rays) as advance:
-            stack.add(exposer.expose(Groups(rays, pixels), starts, advance=advance), chosen)
-        self._develop(exposer, stack.mean())
 
     def _expose_whole(self, step: Pass) -> None:
         """Let an integrator that follows no camera rays expose the film."""
@@ -168,7 +147,7 @@ class Passes:
         # pages (mallopt(3), M_MMAP_THRESHOLD); this one is never written to, and takes no memory
         np.empty(2**25 - 2**16, np.uint8)
         exposer = Exposer(self._job, self._shader, self._shader.film, step.layers)
-        halves = Halves if self._shader.layers else Wholes
+        halves = Wholes if self._plan.whole else Halves
         picture = halves(exposer, self._seed, self._blurred if self._plan.blur else None)
         self.rounds, self.error = run_rounds(picture, self._job.stage, step.goal, self._job.on_round)
         self._develop(exposer, picture.mean())
@@ -228,7 +207,7 @@ class Passes:
             advance(depth[rows].size)
 
     def _blurred(self, picture: np.ndarray) -> np.ndarray:
-        """Return a picture [H, W, 3] with depth of field."""
+        """A picture [H, W, 3] with depth of field."""
         picture = picture.astype(np.float32)
         self._blur(picture, cast(Blur, self._plan.blur), lambda pixels: None, False)
         return picture
@@ -250,7 +229,7 @@ class Passes:
         self._job.workspace.give_back(min(most, height) * width * BYTES_PER_PIXEL_OF_FILTER)
 
     def _layer(self, name: str) -> np.ndarray:
-        """Return a new layer, 0 everywhere; all but the picture channel by channel, as an EXR wants them."""
+        """A new layer of zeros; all but the picture channel by channel, as an EXR wants them."""
         shape = self._plan.seen.height, self._plan.seen.width
         channels = len(TABLE[name].letters)
         planes = np.zeros((*shape, channels) if name == "image" else (channels, *shape), np.float32)

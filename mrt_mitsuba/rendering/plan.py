@@ -148,6 +148,7 @@ class Plan:
     scene: str  #: its number or name
     variant: str  #: of Mitsuba
     integrator: str  #: name of its plugin
+    whole: bool  #: does it give whole pictures only, rather than follow rays from the camera
     width: int  #: pixels
     height: int  #: pixels
     film: str  #: filter and pixel format, where a film is exposed by its own rules rather than a lattice
@@ -222,7 +223,7 @@ class _Choices:
 
 
 def _decide(settings: RenderSettings, source: Source, shader: Shader) -> _Choices:
-    whole = not shader.layers
+    whole = shader.whole
     goal = settings.goal(source.goal)
     aamode = NOISE if goal else settings.aamode
     # Mitsuba's integrators draw random numbers for every ray, and their noise would pass for edges
@@ -282,6 +283,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
         scene=source.name,
         variant=str(mi.variant()),
         integrator=shader.name,
+        whole=shader.whole,
         width=source.width,
         height=source.height,
         film=f"{film.rfilter}, {film.pixel_format or 'spectral bands'}" if on_film else "",
@@ -348,7 +350,6 @@ def _traced(asked: frozenset[str], choices: _Choices, shader: Shader) -> frozens
 def _check(settings: RenderSettings, source: Source, shader: Shader) -> None:
     """Raise ``UsageError`` for options that do not go together."""
     goal = settings.goal(source.goal)
-    whole = not shader.layers
     if goal is None:
         only = "{0} is of use only where rays go in rounds: with target or aamode=noise"
         _refuse(settings, ("maxspp", "maxseconds", "on_round"), (), only)
@@ -361,7 +362,7 @@ def _check(settings: RenderSettings, source: Source, shader: Shader) -> None:
         if settings.error is not None:
             _refuse(settings, ("aamode", "spp"), (NOISE,), both)
         _refuse(settings, ("aa", "lattice", "region"), (FILM,), both)
-    if whole:
+    if shader.whole:
         alone = f"the integrator {shader.name} gives whole pictures, and no single rays"
         leave = f"{{0}}={{1}}: {alone}; leave it out, or choose another, such as path"
         _refuse(settings, ("aamode", "lattice", "motion"), ("none", NOISE, FILM), leave)

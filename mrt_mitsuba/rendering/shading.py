@@ -70,11 +70,11 @@ class RayValues:
         return self.si.is_valid()
 
     def at_hit(self, kind: str, value: mi.Float, miss: float = 0) -> mi.Float:
-        """Return a value, of a type of Mitsuba's, where something is hit, and another elsewhere."""
+        """A value, as a type of Mitsuba's, where something is hit, and ``miss`` elsewhere."""
         return dr.select(self.found, getattr(mi, kind)(value), miss)
 
     def rgb(self, spectrum: mi.UnpolarizedSpectrum) -> mi.Color3f:
-        """Return the linear sRGB of a radiance along the rays, with the sensor's weight."""
+        """The linear sRGB of a radiance along the rays, times the sensor's weight."""
         return to_rgb(spectrum * self.weight, self.ray)
 
     @property
@@ -127,6 +127,7 @@ class Shader:
     facts: SceneFacts | None = None  #: what its kernels depend on; None where it does not say
     kernel: KernelPlan | None = None  #: what its kernels hold
     random = True  #: does it draw random numbers
+    whole = False  #: does it give whole pictures only
 
     def __init__(self, source: Source, motion: Sequence[float] | None) -> None:
         integrator = source.integrator
@@ -156,15 +157,14 @@ class Shader:
             self.name = type(integrator).__name__
         elif not isinstance(integrator, mi.SamplingIntegrator) or "StokesIntegrator" in text_of(integrator):
             # Mitsuba would crash in a sample of stokes, also inside another
+            self.whole = True
             self.layers = frozenset()
         self.aovs = tuple(integrator.aov_names())  #: names of the integrator's own channels
         names = [*OF_FILMS, *self.aovs]
         twice = sorted({name for name in self.aovs if names.count(name) > 1})
         if twice:  # Mitsuba's films refuse them, too
             raise SceneError(
-                f"the integrator has several channels named {twice[0]}; name each differently"
-                if twice[0] not in OF_FILMS
-                else f"the integrator has a channel named {twice[0]}, as films have; name it differently"
+                f"the integrator and films have several channels named {twice[0]}; name each differently"
             )
 
     def read(self) -> list[Any] | None:
@@ -176,7 +176,7 @@ class Shader:
         return [arrays, sky, self.sensor]
 
     def shift(self, time: mi.Float) -> mi.Vector3f:
-        """Return the shift of the camera at a time."""
+        """How far the camera has moved at a time."""
         if self.motion is None:
             return mi.Vector3f(0)
         if mi.variant().startswith("scalar"):
@@ -184,7 +184,7 @@ class Shader:
         return dr.opaque(mi.Vector3f, self.motion) * time
 
     def values(self, place: mi.Point2f, time: mi.Float | None, sampler: mi.Sampler) -> RayValues:
-        """Return the values along rays through places in the picture, [0, 1]².
+        """Trace rays through places in the picture, [0, 1]², for their values.
 
         ``time``: from 0, when the shutter opens, to 1; None: the sampler draws it, as for Mitsuba's sensors.
         Draws what Mitsuba's integrators draw, in their order.
@@ -217,7 +217,7 @@ class Shader:
 
 
 def camera_matrices(sensor: mi.Sensor) -> dict[str, np.ndarray]:
-    """Return the matrices of a camera, float64 [4, 4] for row vectors on their left, as EXR defines them.
+    """The matrices of a camera, float64 [4, 4] for row vectors on their left, as EXR defines them.
 
     ``worldToCamera``: to a camera at the origin that looks along -z, with x to the right and y up.
     ``worldToNDC``, of pinhole cameras: to the picture, x from 0 to 1 to the right and y downwards.
@@ -244,7 +244,7 @@ def camera_matrices(sensor: mi.Sensor) -> dict[str, np.ndarray]:
 
 
 def to_rgb(spectrum: mi.UnpolarizedSpectrum, ray: mi.Ray3f) -> mi.Color3f:
-    """Return the linear sRGB of a spectrum in the current variant."""
+    """The linear sRGB of a spectrum in the current variant."""
     if mi.is_spectral:
         xyz = sum(
             mi.cie1931_xyz(wavelength) * value

@@ -98,7 +98,7 @@ def test_channels_of_one_name_are_refused(aovs, options):
 @pytest.mark.parametrize("name", "RGBAW")
 def test_channels_named_like_those_of_a_film_are_refused(name, options):
     """A film's alpha was lost, and in a file such a channel; Mitsuba's films refuse them."""
-    with pytest.raises(mrt.MrtError, match=f"a channel named {name}, as films have; name it differently"):
+    with pytest.raises(mrt.MrtError, match=f"films have several channels named {name}; name each diff"):
         mrt.render(scene(of_the_user(f"a {name}")), **options)
 
 
