@@ -160,7 +160,7 @@ class Plan:
     samples: int  #: of a pixel, where they are refined or everywhere
     channels: int  #: float32 ones kept for every pixel: the picture, its layers, and the detector's
     motion: str | None  #: "frames", "stratified", "film", or None where the camera stands still
-    moments: int  #: while the shutter is open
+    moments: int  #: while the shutter is open; 0 where the camera stands still
     frames: int  #: pictures to average, each with filters of its own
     seed: int  #: of all random numbers
     layers: frozenset[str]  #: that are returned
@@ -204,7 +204,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class _Choices:
-    """Decisions that the options leave open, made for one scene.
+    """Decisions that the options leave open, made for one scene; by the names of options where they are such.
 
     Someone's own scene is rendered as Mitsuba renders it, the report's scenes as the report does.
     """
@@ -214,11 +214,12 @@ class _Choices:
     aamode: str
     lattice: str
     spp: int
+    focaldist: float  #: 0 for no depth of field
+    focalrange: float
     goal: Goal | None  #: of rounds; None without them
     detector: str | None  #: the edge detector that runs, a key of ``DETECTORS``
-    focus: tuple[float, float]  #: distance, 0 for no depth of field; half-width of the sharp zone
-    motion: str | None  #: see ``Plan``
-    moments: int  #: at which a moving camera sees the scene
+    moving: str | None  #: ``motion`` of the ``Plan``
+    moments: int  #: at which a moving camera sees the scene, else 0
     frames: int
 
 
@@ -240,22 +241,24 @@ def _decide(settings: RenderSettings, source: Source, shader: Shader) -> _Choice
     lattice = settings.lattice or (FILM if source.own or whole or goal else "report")
     refining = aamode in DETECTORS and (aa != 1 or "edges" in settings.layers)
     distance, reach = settings.focus(source.focal_distance, source.focal_range)
-    motion = None
+    moving = None
+    moments = 0
     if settings.motion:
-        motion = FILM if lattice == FILM else settings.motionmode
-    moments = settings.motionsamples if motion else 1
+        moving = FILM if lattice == FILM else settings.motionmode
+        moments = settings.motionsamples
     return _Choices(
         settings=settings,
         aa=aa,
         aamode=aamode,
         lattice=lattice,
         spp=spp,
+        focaldist=distance or 0.0,
+        focalrange=reach,
         goal=goal,
         detector=aamode if refining else None,
-        focus=(distance or 0.0, reach),
-        motion=motion,
+        moving=moving,
         moments=moments,
-        frames=moments if motion == "frames" and (refining or distance) else 1,
+        frames=moments if moving == "frames" and (refining or distance) else 1,
     )
 
 
@@ -274,7 +277,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
     names = {step.name for step in passes}
     returned = asked | {name for name in possible if names & set(TABLE[name].free_with)}
     region = Region(*(settings.region or (0, 0, source.width, source.height)))
-    reach = edges.REACH * bool(choices.detector) + dof.REACH * bool(choices.focus[0])
+    reach = edges.REACH * bool(choices.detector) + dof.REACH * bool(choices.focaldist)
     channels = sum(len(TABLE[name].letters) for name in traced | returned)
     if on_film:  # sums by pixel, in double precision, while a film is exposed
         channels += ROUND_CHANNELS if choices.goal else FILM_CHANNELS
@@ -294,7 +297,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
         seen=region.grown(reach, source.width, source.height),
         samples=choices.aa**2,
         channels=channels,
-        motion=choices.motion,
+        motion=choices.moving,
         moments=choices.moments,
         frames=choices.frames,
         seed=settings.seed,
@@ -309,16 +312,12 @@ def _in_force(choices: _Choices, source: Source, shader: Shader, returned: froze
     """The options that shape the picture, with the values that were decided."""
     settings = choices.settings
     goal = choices.goal
-    values = {name: getattr(settings, name) for name in _NAMED} | {
+    values = {name: getattr(settings, name) for name in _NAMED}
+    values |= {name: value for name, value in vars(choices).items() if name in _NAMED}
+    values |= {
         "width": source.width,
         "height": source.height,
-        "aa": choices.aa,
-        "aamode": choices.aamode,
-        "lattice": choices.lattice,
-        "spp": choices.spp,
         "fresnel": source.fresnel,
-        "focaldist": choices.focus[0],
-        "focalrange": choices.focus[1],
         "layers": tuple(name for name in settings.layers if name in returned),
         "variant": str(mi.variant()),
         "integrator": shader.name,
@@ -338,7 +337,7 @@ def _traced(asked: frozenset[str], choices: _Choices, shader: Shader) -> frozens
     traced = {"image", *asked}
     read = DETECTORS[choices.detector] if choices.detector else ()
     traced.update(read)
-    if choices.focus[0]:
+    if choices.focaldist:
         traced.add("depth")
     if choices.spp > 1 and "image" in read:
         traced.add("square")
@@ -419,7 +418,7 @@ def _passes(traced: frozenset[str], choices: _Choices, shader: Shader) -> Iterat
     at_centre = frozenset(name for name in traced if TABLE[name].source == FIRST_HIT)
     if at_centre and (on_film or (choices.detector is None and not all_samples.holds_centre)):
         # layers of the first hit belong to the pixel's centre
-        yield FirstHits(layers=at_centre, places=Places(moments=int(choices.motion is not None)))
+        yield FirstHits(layers=at_centre, places=Places(moments=min(choices.moments, 1)))
         traced -= at_centre
     if choices.goal:
         yield Rounds(layers=traced, places=Places(FILM), goal=choices.goal)
@@ -435,36 +434,33 @@ def _passes(traced: frozenset[str], choices: _Choices, shader: Shader) -> Iterat
             first = 1 if on_film or all_samples.holds_centre else 0  # the centre is not traced again
             places = _samples(choices, first)
             yield Refinement(layers=traced - at_centre - {"square"}, places=places)
-    distance, reach = choices.focus
-    if distance:
-        yield Blur(mode=choices.settings.dof, focal_distance=distance, focal_range=reach)
+    if choices.focaldist:
+        mode = choices.settings.dof
+        yield Blur(mode=mode, focal_distance=choices.focaldist, focal_range=choices.focalrange)
 
 
 def _samples(choices: _Choices, first: int = 0) -> Places:
     """The samples of a pixel from number ``first`` on."""
     repeats = choices.spp
-    aa = choices.aa
-    count = aa**2 - first
-    moments = choices.moments if choices.motion else 0
+    moments = choices.moments
+    count = choices.aa**2 - first
     stratified = choices.settings.motionmode == "stratified"
-    if choices.lattice == FILM:
-        if moments:  # each ray has a moment of its own
-            repeats = max(repeats, -(-moments // aa**2)) if stratified else repeats * moments
-        return Places(FILM, aa, first=first, count=count, repeats=repeats)
+    if choices.lattice == FILM:  # each ray has a moment of its own
+        wanted = math.ceil(moments / choices.aa**2) if stratified else repeats * moments
+        return Places(FILM, choices.aa, first=first, count=count, repeats=max(repeats, wanted))
     if moments and stratified:  # every ray of a pixel in a part of its own
         rays = repeats * math.ceil(moments / (count * repeats))
-        return Places(choices.lattice, aa, first, count, repeats=rays, moments=count * rays, phase=None)
-    return replace(_centre(choices), lattice=choices.lattice, aa=aa, first=first, count=count)
+        return Places(
+            choices.lattice, choices.aa, first, count, repeats=rays, moments=count * rays, phase=None
+        )
+    return replace(_centre(choices), lattice=choices.lattice, aa=choices.aa, first=first, count=count)
 
 
 def _centre(choices: _Choices) -> Places:
     """The pixel's centre alone, at the same times in every pixel."""
-    if choices.motion is None:
-        return Places(repeats=choices.spp)
-    if choices.frames > 1:
-        return Places(repeats=choices.spp, moments=1)
+    moments = choices.moments if choices.frames == 1 else 1
     phase = 0.5 if choices.settings.motionmode == "stratified" else 0.0
-    return Places(repeats=choices.spp * choices.moments, moments=choices.moments, phase=phase)
+    return Places(repeats=choices.spp * max(moments, 1), moments=moments, phase=phase)
 
 
 def _left_out(
