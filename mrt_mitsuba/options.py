@@ -207,12 +207,17 @@ def check(name: str, kind: Kind, value: Any, *, text: bool = False) -> Any:
         raise UsageError(f"{name}={shown}: must be {kind.allowed}") from None
 
 
+def is_path(scene: object, ending: str) -> bool:
+    """Whether a scene is given as a path with this ending."""
+    return isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(ending)
+
+
 def is_obj(scene: object, model: Values) -> bool:
     """Whether a scene is given as the path of an OBJ file.
 
     Raises ``UsageError`` for options of a model where it is not.
     """
-    obj = isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(".obj")
+    obj = is_path(scene, ".obj")
     useless = [name for name, value in model.items() if (name, value) != ("convention", "report")]
     if useless and not obj:
         raise UsageError(f"{useless[0]} is of use only with an OBJ file: scene=PATH.obj")

@@ -153,12 +153,16 @@ class Shader:
             self.kernel = self._data.plan
             self.random = self.kernel.random
             self.layers |= integrator.provided_layers
-        elif self._derivatives:
-            self.name = type(integrator).__name__
-        elif not isinstance(integrator, mi.SamplingIntegrator) or "StokesIntegrator" in text_of(integrator):
-            # Mitsuba would crash in a sample of stokes, also inside another
-            self.whole = True
-            self.layers = frozenset()
+        else:
+            if self._derivatives:
+                self.name = type(integrator).__name__
+            self.whole = (
+                not isinstance(integrator, mi.SamplingIntegrator)
+                or "StokesIntegrator" in text_of(integrator)  # Mitsuba would crash in its sample
+                or _depth(integrator, "render") < _depth(integrator, "sample")
+            )
+            if self.whole:
+                self.layers = frozenset()
         self.aovs = tuple(integrator.aov_names())  #: names of the integrator's own channels
         names = [*OF_FILMS, *self.aovs]
         twice = sorted({name for name in self.aovs if names.count(name) > 1})
@@ -214,6 +218,11 @@ class Shader:
             medium = sensor.get_medium()  # that the camera is in
             radiance, valid, aovs = self.integrator.sample(self.scene, sampler, differential, medium)
         return RayValues(self, ray, weight, mi.unpolarized_spectrum(radiance), valid, aovs=aovs)
+
+
+def _depth(integrator: mi.Integrator, method: str) -> int:
+    """The place of the class that defines a method among those that an integrator derives from."""
+    return next(depth for depth, each in enumerate(type(integrator).__mro__) if method in vars(each))
 
 
 def camera_matrices(sensor: mi.Sensor) -> dict[str, np.ndarray]:

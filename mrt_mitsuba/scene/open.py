@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.machine import Budget
-from mrt_mitsuba.options import Values, is_obj
+from mrt_mitsuba.options import Values, is_obj, is_path
 from mrt_mitsuba.plugins.variants import text_of
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene
@@ -62,7 +62,7 @@ def open_scene(
     params = params or {}
     keys = {key: value for key, value in params.items() if "." in key}
     declared = {key: value for key, value in params.items() if "." not in key}
-    if declared and not str(scene).lower().endswith(".xml"):
+    if declared and not is_path(scene, ".xml"):
         raise UsageError(
             f"params: {next(iter(declared))} is not a key of mi.traverse, and only an XML file declares names"
         )
@@ -165,7 +165,7 @@ def _loaded(
     if isinstance(scene, mi.Scene):
         return "a Mitsuba scene", scene, {}
     _check_variant("scene", scene)
-    raise UsageError(f"scene is {scene!r}: give a number, a Scene, a dict, a Mitsuba scene or a path")
+    raise UsageError(f"scene is {text_of(scene)}: give a number, a Scene, a dict, a Mitsuba scene or a path")
 
 
 def _check_variant(name: str, thing: object) -> None:

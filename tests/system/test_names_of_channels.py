@@ -125,6 +125,37 @@ def test_integrators_without_to_string(door):
     assert_allclose(doors[door](), 0.25, rtol=1e-5)
 
 
+def test_integrators_without_to_string_in_errors_and_studies():
+    """Each was nanobind's "lookup failed!"."""
+    loaded = scene(of_the_user("a"))
+    with pytest.raises(mrt.UsageError, match="only an XML file declares names"):
+        mrt.render(loaded, params={"width": 3})
+    with pytest.raises(mrt.UsageError, match="scene is Named: give a number"):
+        mrt.render(loaded.integrator())
+    found = mrt.error_vs_time(loaded, {"it": {"spp": 1}}, reference={"spp": 2}, repeats=2)
+    assert_allclose(found.points["it"].rmse, 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{}, {"spp": 4}, {"target": 0.1, "maxspp": 64}], ids=str)
+@pytest.mark.parametrize("base", ["SamplingIntegrator", "prb"])
+def test_an_integrator_may_render_by_itself(base, options):
+    """One that overrides ``render`` gives whole pictures, as in ``mi.render``, whatever its base samples."""
+    mother = getattr(mi, base, None) or type(mi.load_dict({"type": base}))
+
+    class Gray(mother):  # type: ignore[misc, valid-type]
+        def render(self, scene: mi.Scene, sensor: Any = 0, seed: int = 0, spp: int = 0, *_: Any, **__: Any):
+            film = (scene.sensors()[sensor] if isinstance(sensor, int) else sensor).film()
+            film.prepare([])
+            values = mi.TensorXf(np.full((6, 8, 4), [0.5, 0.5, 0.5, 2], np.float32))
+            film.put_block(mi.ImageBlock(values, offset=[0, 0], rfilter=film.rfilter(), border=False))
+            return film.develop()
+
+    mi.register_integrator("gray", Gray)
+    for loaded in scene({"type": "gray"}), scene({"type": "mrt_adaptive", "nested": {"type": "gray"}}):
+        assert_allclose(np.array(mi.render(loaded))[..., :3], 0.25)
+        assert_allclose(mrt.render(loaded, **options).image, 0.25)
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 2)])
 def test_the_smallest_films_print_nothing(variant, size, capfd):

@@ -20,6 +20,7 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, UsageError
+from mrt_mitsuba.options import is_path
 from mrt_mitsuba.rendering.api import Result, render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
@@ -334,7 +335,7 @@ def _runner(scene: Given, shared: Options) -> Run:
             "seed": seed,
         }
         one = given.pop("scene")
-        loadable = isinstance(one, dict) or str(one).lower().endswith(".xml")
+        loadable = isinstance(one, dict) or is_path(one, ".xml")
         if loadable and given["variant"] == variant and "params" not in given:
             if id(one) not in loaded:
                 loaded[id(one)] = open_scene(one).scene
