@@ -12,7 +12,17 @@ import numpy as np
 from mrt_mitsuba.validation.checks import bsdf_case, noise, probe
 from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
-from mrt_mitsuba.validation.checks.law import Figure, Law, Skip, at_least, at_most, figures, most, number_of
+from mrt_mitsuba.validation.checks.law import (
+    Figure,
+    Law,
+    Skip,
+    at_least,
+    at_most,
+    figures,
+    judge_many,
+    most,
+    number_of,
+)
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar
 
 TWO_WAYS = "two ways to the same number"
@@ -169,7 +179,7 @@ SPOILS = "one such number spoils a picture"
     values=number_of(WRONG, 0, SPOILS, VALUE),
     samples=number_of(WRONG, 0, SPOILS, SAMPLE),
     million=at_most(
-        "samples of {count} at random whose weight, density or value is not finite, or negative",
+        "samples of {count} at random that are not finite, or negative, or of directions not of length 1",
         0,
         SPOILS,
         SAMPLE,
@@ -179,8 +189,7 @@ def finite(law: Law, case: Case) -> None:
     """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
     extremes = _extremes(case)
     sound = _finite(law, case, extremes)
-    if not is_scalar():
-        _by_the_million(law, case)
+    judge_many(law, case, partial(_at_random, case))
     for key, value in parameters(case) if sound else ():
         for end in _ends(key, float(np.mean(np.array(value)))):  # one parameter at a time
             copy = case.copy()
@@ -246,25 +255,19 @@ def _bad(values: Array) -> Array:
     return ~sound.reshape(len(values), -1).all(axis=1)
 
 
-def _by_the_million(law: Law, case: Case) -> None:
-    """Ordinary samples from all directions, so many that a fault in one of a hundred thousand shows."""
-    count = case.count(2**19, 2**22)
-    rng = probe.random_numbers(count, case.seed)
-    draw = rng.next_float32
+def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
+    """Ordinary samples from all directions, and which of them are not finite, or negative."""
     wi = mi.warp.square_to_uniform_sphere(mi.Point2f(draw(), draw()))
     uv = mi.Point2f(draw(), draw())
     u = mi.Point3f(draw(), draw(), draw())
-    si = probe.interaction(wi, uv)
-    with dr.suspend_grad():
-        bs, weight = case.plugin.sample(context(), si, u.x, mi.Point2f(u.y, u.z))
-        weight = mi.unpolarized_spectrum(weight)
-        lit = dr.any(weight != 0)
-        value, pdf = case.plugin.eval_pdf(context(), si, bs.wo, lit)
-        value = mi.unpolarized_spectrum(value)
-        read = probe.not_finite(bs.pdf, value, pdf, least=0)
-        bad = probe.not_finite(weight, least=0) | (lit & read)
-    wrong, first = probe.first_of(bad, wi=wi, uv=uv, u=u)
-    law.hold("million", wrong, first, count=count)
+    bs, weight = case.plugin.sample(context(), probe.interaction(wi, uv), u.x, mi.Point2f(u.y, u.z))
+    weight = mi.unpolarized_spectrum(weight)
+    lit = dr.any(weight != 0)
+    value, pdf = case.plugin.eval_pdf(context(), probe.interaction(wi, uv), bs.wo, lit)
+    value = mi.unpolarized_spectrum(value)
+    read = probe.not_finite(bs.pdf, bs.eta, value, pdf, least=0) | probe.not_unit(bs.wo)
+    bad = probe.not_finite(weight, least=0) | (lit & read)
+    return bad, {"wi": wi, "uv": uv, "u": u}
 
 
 NOISE = """for k in range(9):  # float32 steps in all components: a smooth function would change evenly

@@ -5,8 +5,8 @@ A new law is a function of ``Law`` and ``Case`` and a row of ``LAWS``; see ``bsd
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from functools import cached_property
+from collections.abc import Callable, Iterable
+from functools import cached_property, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +26,7 @@ from mrt_mitsuba.validation.checks.law import (
     at_most,
     examine,
     figures,
+    judge_many,
     most,
     number_of,
     rare,
@@ -271,14 +272,17 @@ def _shares(case: Case, cells: Cells, rng: np.random.Generator) -> tuple[Array, 
 
 
 def _directions(case: Case, u: Array) -> Array:
-    """Sampled directions from one point, by random numbers [N, 2]. [N, 3]"""
+    """Sampled directions from one point, by random numbers [N, 2], without those refused in the light."""
     o = mi.Point3f(*map(float, case.points[0]))
 
-    def call(u: mi.Point2f) -> mi.Vector3f:
-        ds, _ = case.plugin.sample_direction(_seen_from(o), u)
-        return ds.d
+    def call(u: mi.Point2f) -> list[mi.Float]:
+        it = _seen_from(o)
+        ds, weight = case.plugin.sample_direction(it, u)
+        return [ds.d, weight, case.plugin.eval_direction(it, ds)]
 
-    return lanes(call, ("Point2f", u))[0]
+    d, weight, value = lanes(call, ("Point2f", u))
+    refused = (weight == 0).all(axis=1) & (value > 0).any(axis=1)
+    return d[~refused]
 
 
 @figures(
@@ -301,7 +305,8 @@ def weights(law: Law, case: Case) -> None:
 @figures(
     bad=number_of("samples that are not finite, or negative, or not of unit length", 0, SPOILS),
     million=at_most(
-        "samples of {count} from one point whose weight, density or direction is not finite, or negative",
+        "samples of {count} from one point that are not finite, or negative, or whose direction is not of "
+        "length 1",
         0,
         SPOILS,
     ),
@@ -313,22 +318,17 @@ def finite(law: Law, case: Case) -> None:
     length = abs(norm(np.float64(s.d), axis=1) - 1)
     usable = (length <= LENGTH) & np.isfinite(s.dist) & (s.pdf >= 0)
     law.hold("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable))
-    if not probe.is_scalar():
-        _by_the_million(law, case)
+    judge_many(law, case, partial(_at_random, case))
 
 
-def _by_the_million(law: Law, case: Case) -> None:
-    """So many samples that a fault in one of a hundred thousand shows."""
-    count = case.count(2**19, 2**22)
-    rng = probe.random_numbers(count, case.seed)
-    with dr.suspend_grad():
-        it = _seen_from(mi.Point3f(*map(float, case.points[0])))
-        ds, weight = case.plugin.sample_direction(it, mi.Point2f(rng.next_float32(), rng.next_float32()))
-        weight = mi.unpolarized_spectrum(weight)
-        lit = dr.any(weight != 0)
-        read = probe.not_finite(ds.pdf, least=0) | probe.not_finite(ds.d)
-        bad = probe.not_finite(weight, least=0) | (lit & read)
-        law.hold("million", int(dr.count(bad)[0]), count=count)
+def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
+    """Samples from one point, and which of them are not finite, or negative."""
+    it = _seen_from(mi.Point3f(*map(float, case.points[0])))
+    ds, weight = case.plugin.sample_direction(it, mi.Point2f(draw(), draw()))
+    weight = mi.unpolarized_spectrum(weight)
+    lit = dr.any(weight != 0)
+    read = probe.not_finite(ds.pdf, ds.dist, least=0) | probe.not_unit(ds.d)
+    return probe.not_finite(weight, least=0) | (lit & read), {}
 
 
 _ALL = (density, sampling, weights, finite)

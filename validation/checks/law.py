@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.scene.loading import load_dict
-from mrt_mitsuba.validation.checks.probe import Array, Lanes, is_scalar, unit
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, is_scalar, stratified, unit
 from mrt_mitsuba.validation.tools.study import Bound, Study, notebook, save_report
 
 TITLE = "Laws of plugins"
@@ -367,6 +367,26 @@ class Subject:
         """The scalar variant of a vectorised one, or the other way around."""
         here = mi.variant()
         return here.replace("scalar_", "llvm_ad_") if is_scalar() else f"scalar_{here.split('_', 2)[-1]}"
+
+
+def judge_many(
+    law: Law, case: Subject, call: Callable[[Callable[[], mi.Float]], tuple[mi.Mask, dict[str, mi.Point3f]]]
+) -> None:
+    """Hold ``million`` to so many lanes that a fault in one of a hundred thousand shows.
+
+    ``call(draw)`` gives the lanes that are bad, and what else snippets show of the first of them, in terms of
+    random numbers that ``draw()`` makes. Scalar variants are too slow for this.
+    """
+    if is_scalar():
+        return
+    count = case.count(2**20, 2**22)
+    with dr.suspend_grad():
+        bad, columns = call(stratified(count, case.seed))
+        dr.eval(bad, *columns.values())
+        wrong = dr.compress(bad)
+    index = wrong[0] if dr.width(wrong) else 0
+    first = {name: np.float32(np.array(x)[:, index]) for name, x in columns.items()}
+    law.hold("million", dr.width(wrong), count=count, **first)
 
 
 def class_name(plugin: mi.Object) -> str:

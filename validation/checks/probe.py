@@ -74,9 +74,25 @@ def at_wavelengths(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     return si
 
 
-def random_numbers(count: int, seed: int) -> mi.PCG32:
-    """A generator in ``count`` lanes; no part of a kernel depends on the seed."""
-    return mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))
+def stratified(count: int, seed: int) -> Callable[[], mi.Float]:
+    """A source of random numbers in ``count`` lanes, a power of two: each call has one in every 1 / count.
+
+    So a fault in a slice of any one of them is met, if it is wider than two of these parts.
+    """
+    jitter = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))  # no part of a kernel depends on the seed
+    multipliers = np.random.default_rng(seed)
+    lane = dr.arange(mi.UInt32, count)
+
+    def draw() -> mi.Float:
+        part = lane
+        for _ in range(3):  # a permutation: each step can be undone
+            odd = 2 * int(multipliers.integers(2**30)) + 1
+            part = (part * dr.opaque(mi.UInt32, odd)) & (count - 1)
+            part ^= part >> (count.bit_length() // 2)
+        number = (mi.Float(part) + jitter.next_float32()) / count
+        return dr.minimum(number, dr.one_minus_epsilon(mi.Float))
+
+    return draw
 
 
 class Probe:
@@ -146,13 +162,9 @@ def not_finite(*values: mi.Float | mi.Spectrum, least: float = -np.inf) -> mi.Ma
     return bad
 
 
-def first_of(bad: mi.Mask, **columns: mi.Point3f) -> tuple[int, Lanes]:
-    """In how many lanes something is bad, and a row of each column in the first of these."""
-    dr.eval(bad, *columns.values())
-    wrong = dr.compress(bad)
-    index = wrong[0] if dr.width(wrong) else 0
-    first = {name: np.float32(np.array(x)[:, index]) for name, x in columns.items()}
-    return dr.width(wrong), Lanes(**first)
+def not_unit(d: mi.Vector3f) -> mi.Mask:
+    """Where directions are not of length 1, or not finite."""
+    return ~(dr.abs(dr.squared_norm(d) - 1) < 2e-3)
 
 
 def lanes(call: Call, *columns: tuple[str, Array]) -> list[Array]:

@@ -141,7 +141,7 @@ class Case(Subject):
     @cached_property
     def positions(self) -> tuple[list[Array], Array, float]:
         """Sampled positions: points, normals, densities stated and asked for; their ``u``; and the area."""
-        u = self.uniform(self.count(2**14, 2**19), 2)
+        u = self.uniform(self.count(2**16, 2**19), 2)
 
         def sample(second: mi.Point2f) -> list[mi.Float]:
             ps = self.plugin.sample_position(0, second)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -27,11 +29,8 @@ from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import (
     Array,
     Lanes,
-    first_of,
-    is_scalar,
     lanes,
     not_finite,
-    random_numbers,
     unit,
 )
 from mrt_mitsuba.validation.checks.shape_case import (
@@ -469,15 +468,11 @@ def finite(law: Law, case: Case) -> None:
     numbers = np.concatenate([hits.t[:, None], *vectors], axis=1)
     sound = np.isfinite(numbers).all(axis=1) & (hits.t >= 0)
     law.hold("bad", np.where(hits.met, ~sound, np.isnan(hits.t)), hits)  # a miss is infinitely far
-    if not is_scalar():
-        _by_the_million(law, case)
+    laws.judge_many(law, case, partial(_at_random, case))
 
 
-def _by_the_million(law: Law, case: Case) -> None:
-    """So many rays and positions that a fault in one of a hundred thousand shows."""
-    count = case.count(2**19, 2**22)
-    rng = random_numbers(count, case.seed)
-    draw = rng.next_float32
+def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
+    """Rays from all around and sampled positions, and which of them have numbers that are not finite."""
     middle = mi.Point3f(*map(float, case.middle))
     extent = mi.Vector3f(*map(float, np.maximum(case.high - case.low, 0.01 * case.size)))
     away = mi.warp.square_to_uniform_sphere(mi.Point2f(draw(), draw()))
@@ -489,8 +484,7 @@ def _by_the_million(law: Law, case: Case) -> None:
     with suppress(AttributeError, RuntimeError):
         ps = case.plugin.sample_position(0, mi.Point2f(draw(), draw()))
         bad |= not_finite(ps.p, ps.n, ps.pdf)
-    wrong, first = first_of(bad, o=o, d=d)
-    law.hold("million", wrong, first, count=count)
+    return bad, {"o": o, "d": d}
 
 
 @figures(
