@@ -171,7 +171,9 @@ OF_SAMPLES = {
     "no eta^2 in single directions": Mistake("sample", unscaled, SINGLE, GLASS),
     "eta inverted": Mistake("sample", member("eta", inverted), SINGLE, GLASS),
     "eta of 0": Mistake("sample", member("eta", nothing), {"reciprocity.medium"}, GLOSS),
-    "directions not of length 1": Mistake("sample", member("wo", too_long), {"finite.samples"}, MIRROR),
+    "directions not of length 1": Mistake(
+        "sample", member("wo", too_long), {"finite.samples", "finite.million"}, MIRROR
+    ),
     "mirror turned": Mistake("sample", member("wo", turned), {"reciprocity.returns"}, MIRROR),
     "mirror to the other side": Mistake(
         "sample",

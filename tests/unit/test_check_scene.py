@@ -15,7 +15,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.validation.checks import emitter as emitters
 from mrt_mitsuba.validation.checks import scene as checks
-from mrt_mitsuba.validation.checks.law import Check
+from mrt_mitsuba.validation.checks.examine import Check
 from mrt_mitsuba.validation.studies import power
 from mrt_mitsuba.validation.studies.power import changed_bsdf, changed_sky, put
 
@@ -172,11 +172,11 @@ def too_long(ds, u):
     return put(ds, d=1.0005 * ds.d)
 
 
-def no_number(weight, u):
+def no_number(weight, u, ds):
     return dr.select(u.x > 0.99, dr.nan, weight)
 
 
-def negative(weight, u):
+def negative(weight, u, ds):
     return -weight
 
 
@@ -259,7 +259,7 @@ def test_what_is_no_emitter(given):
 
 
 def test_each_figure_of_an_emitter_has_a_specimen():
-    known = {fault.figure for fault in power.FAULTS if fault.kind == "emitter"}
+    known = {f"{fault.law}.{fault.figure}" for fault in power.KINDS["emitter"].faults}
     known |= {
         "sampling.place",
         "sampling.counts",

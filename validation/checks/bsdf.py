@@ -1,35 +1,19 @@
 """``check_bsdf``: the laws that any BSDF must obey, stock or in Python, reflecting or transmitting.
 
-A new law is a function of ``Law`` and ``Case`` in a module next to this one, and a row of ``LAWS``. Its
-docstring states it; ``figures`` are what it measures, each with its statistic, limit, reason, and the snippet
-that shows the worst case.
+A law is a function under ``@figures`` in one of the modules of ``LAWS``; ``law.py`` says what belongs to it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
+from mrt_mitsuba.validation.checks import bsdf_components, bsdf_gradients, bsdf_samples, bsdf_values
 from mrt_mitsuba.validation.checks.bsdf_case import Case
-from mrt_mitsuba.validation.checks.bsdf_components import components, switch, variants
-from mrt_mitsuba.validation.checks.bsdf_gradients import gradients
-from mrt_mitsuba.validation.checks.bsdf_samples import energy, sampling, weights
-from mrt_mitsuba.validation.checks.bsdf_values import eval_pdf, finite, reciprocity, roundoff
-from mrt_mitsuba.validation.checks.law import TIMEOUT, Check, Given, examine
+from mrt_mitsuba.validation.checks.examine import TIMEOUT, Check, examine
+from mrt_mitsuba.validation.checks.law import laws_in
+from mrt_mitsuba.validation.checks.subject import Given
 
-_ALL = (
-    sampling,
-    weights,
-    eval_pdf,
-    energy,
-    reciprocity,
-    finite,
-    roundoff,
-    gradients,
-    components,
-    variants,
-    switch,
-)
-LAWS = {law.__name__: law for law in _ALL}
+LAWS = laws_in(bsdf_samples, bsdf_values, bsdf_gradients, bsdf_components)
 
 
 def check_bsdf(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
-from mrt_mitsuba.validation.checks.law import Law, Skip, at_most, figures, most, number_of
+from mrt_mitsuba.validation.checks.law import Law, Skip, at_most, figures, finds, most, number_of
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, context, excess
 
 FLAGS = "print([hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())], hex(int(bsdf.flags())))\n"
@@ -27,6 +28,24 @@ for i in range(8):
 """
 SIDES = "reflection stays on its side, transmission crosses, lobes of one direction have no value"
 SELECTS = "ctx.type_mask selects lobes: integrators that treat some apart count others twice"
+
+
+def by_component(size, value, ctx, *_):
+    return value * (1 + size * (ctx.component == 0))
+
+
+def by_mask(size, value, ctx, *_):
+    """Larger where lobes are asked for by their types."""
+    every = mi.BSDFContext().type_mask
+    return value * (1 + size * (ctx.type_mask != every))
+
+
+def without_mask(size, ctx):
+    """The types of lobes are ignored, whatever the size."""
+    other = mi.BSDFContext()
+    other.mode = ctx.mode
+    other.component = ctx.component
+    return other
 
 
 @figures(
@@ -54,6 +73,9 @@ SELECTS = "ctx.type_mask selects lobes: integrators that treat some apart count 
         "samples and densities of lobes that the mask of types {mask:#x} leaves out", 0, SELECTS, MASKED
     ),
 )
+@finds("sum", "a component brighter than its share", 1e-4, eval=by_component)
+@finds("masked", "lobes brighter where they are asked for by type", 1e-4, eval=by_mask)
+@finds("masked_samples", "types of lobes ignored", 1, context=without_mask)
 def components(law: Law, case: Case) -> None:
     """Flags of components say what they do; f = Σ fᵢ; ``component`` and ``type_mask`` of ``ctx`` select."""
     bsdf = case.plugin
@@ -135,6 +157,11 @@ def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
         law.hold("masked_samples", bad, few, mask=mask)
 
 
+def by_variant(size, value, *_):
+    """Larger in scalar variants."""
+    return value if dr.is_jit_v(value) else (1 + size) * value
+
+
 @figures(
     same=most(
         "value and density in {other} against {here}, relative, beyond rounding",
@@ -143,6 +170,7 @@ def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
         VALUE,
     )
 )
+@finds("same", "values larger in scalar variants", 3e-3, value=by_variant)
 def variants(law: Law, case: Case) -> None:
     """Values in the scalar variant, and in the spectral one where colours are grey."""
     here = mi.variant()

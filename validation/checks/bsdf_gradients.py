@@ -11,7 +11,8 @@ import numpy as np
 
 from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.bsdf_case import Case, affine, changed, live, narrow, parameters
-from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, at_most, figures, most, number_of
+from mrt_mitsuba.validation.checks.faults import GLOSS, of_weight
+from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, at_most, figures, finds, most, number_of
 from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Lanes, Probe, as_mitsuba, context, excess
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
@@ -55,6 +56,11 @@ print("after an update to {number}:", bsdf.eval(ctx, si, wo), "should be", {valu
 """
 
 
+def steeper(size, value, *_):
+    """The same number, with a larger derivative."""
+    return value + size * (value - dr.detach(value))
+
+
 @figures(
     values=at_most(
         "derivative of values by {key}{how}, relative, beyond the error of differences",
@@ -88,6 +94,8 @@ print("after an update to {number}:", bsdf.eval(ctx, si, wo), "should be", {valu
         UPDATE,
     ),
 )
+@finds("values", "derivative of values too large", 0.03, nested=GLOSS, value=steeper)
+@finds("weights", "derivative of weights too large", 0.03, nested=GLOSS, sample=of_weight(steeper))
 def gradients(law: Law, case: Case) -> None:
     """∂/∂π of the mean value, by forward derivatives, against differences, for every parameter π."""
     if "_ad_" not in mi.variant():

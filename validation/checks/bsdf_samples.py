@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy import stats
 
 from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, live, narrow
 from mrt_mitsuba.validation.checks.bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
-from mrt_mitsuba.validation.checks.law import SIGMAS, Law, at_most, figures, most, rare, share_of
+from mrt_mitsuba.validation.checks.faults import (
+    DEGREE,
+    PLACE,
+    larger,
+    member,
+    of_sample,
+    of_weight,
+    put,
+    smaller,
+)
+from mrt_mitsuba.validation.checks.law import SIGMAS, Law, at_most, figures, finds, most, rare, share_of
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
 from mrt_mitsuba.validation.checks.sphere import (
     Cells,
@@ -29,6 +41,37 @@ NUDGE = 2.0**-18  # of a random number: a hundred roundings of the direction
 GRAZING = (83, 86, 88, 89.5, 94, 92, 90.5)  # degrees
 AGAIN = "the same formula, evaluated once more at a rounded direction"
 FITS = "rational fits of Smith's G1 in use are off by 0.35 %"
+
+
+def in_tenth(size, pdf, ctx, wi, wo):
+    """Larger where a tenth of the samples of a diffuse BSDF go."""
+    return pdf * dr.select(wo.x > 0.687, 1 + size, 1)
+
+
+def in_cone(size, pdf, ctx, wi, wo):
+    inside = dr.norm(wo - mi.Vector3f(PLACE)) < DEGREE
+    return pdf * dr.select(inside, 1 - min(size, 0.9), 1)
+
+
+def no_density(size, pdf, ctx, wi, wo):
+    """0 in a slice of azimuth, so many degrees wide."""
+    azimuth = dr.atan2(wo.y, wo.x)
+    return dr.select((azimuth > 1) & (azimuth < 1 + size * DEGREE), 0, pdf)
+
+
+def around_slice(size, bs, weight, *_):
+    """Samples of a diffuse BSDF that keep out of a slice of azimuth, so many degrees wide."""
+    azimuth = dr.atan2(bs.wo.y, bs.wo.x)
+    slice_ = size * DEGREE
+    squeezed = 1 + slice_ + (azimuth + dr.pi) * (1 - slice_ / (2 * dr.pi))
+    radius = dr.hypot(bs.wo.x, bs.wo.y)
+    wo = mi.Vector3f(radius * dr.cos(squeezed), radius * dr.sin(squeezed), bs.wo.z)
+    return put(bs, wo=wo), weight
+
+
+def stairs_of(size, u):
+    """Random numbers in steps."""
+    return mi.Point2f(dr.floor(u.x / size) * size, u.y)
 
 
 @figures(
@@ -54,6 +97,12 @@ FITS = "rational fits of Smith's G1 in use are off by 0.35 %"
         VALUE,
     ),
 )
+@finds("cells", "density too large where a tenth of the samples go", 0.03, quick=0.1, pdf=in_tenth)
+@finds("small", "density too small in a cone of 1 degree", 0.5, quick=np.inf, pdf=in_cone)
+@finds("slices", "no samples in a slice of azimuth, in degrees", 0.3, quick=np.inf, sample=around_slice)
+@finds("dark", "no density in a slice of azimuth, in degrees", 0.3, pdf=no_density)
+@finds("still", "directions in stairs, in random numbers", 1e-5, u=stairs_of)
+@finds("integral", "density too large everywhere", 0.01, pdf=larger)
 def sampling(law: Law, case: Case) -> None:
     """Samples against the density: ∫ pdf dω over a cell is the share of samples in it (Pearson's χ²).
 
@@ -137,6 +186,11 @@ def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
     law.hold("slices", cells.rarest_slice(seen, expected, variance, FIT), wi=view.wi, uv=view.uv)
 
 
+def weight_in_stairs(size, weight, u):
+    odd = dr.floor(16 * u.x) - 2 * dr.floor(8 * u.x)
+    return weight * (1 + size * odd)
+
+
 @figures(
     density=most(f"density of a sample against pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
     weight=most(f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
@@ -146,6 +200,16 @@ def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
         "a count",
         WHOLE,
     ),
+)
+@finds("density", "density that a sample states too large", 3e-3, sample=of_sample(member("pdf", larger)))
+@finds("weight", "weight of a sample too large", 3e-3, sample=of_weight(larger))
+@finds("weight", "weight of a sample in stairs", 3e-3, sample=of_weight(weight_in_stairs))
+@finds(
+    "discrete",
+    "probability of a single direction too small",
+    5e-3,
+    nested={"type": "conductor"},
+    sample=of_sample(member("pdf", smaller)),
 )
 def weights(law: Law, case: Case) -> None:
     """Density and weight of a sample are ``pdf`` and ``eval`` / ``pdf`` of its direction.
@@ -180,6 +244,11 @@ def weights(law: Law, case: Case) -> None:
         law.hold("discrete", errors, case.incidence.only(angles))
 
 
+def too_bright(size, value, *_):
+    """A diffuse BSDF of albedo 0.5 that reflects more than arrives."""
+    return 2 * (1 + size) * value
+
+
 @figures(
     largest=most(
         f"largest albedo, less {SIGMAS} standard errors",
@@ -194,6 +263,8 @@ def weights(law: Law, case: Case) -> None:
         WHOLE,
     ),
 )
+@finds("largest", "albedo above 1", 0.01, value=too_bright)
+@finds("apart", "value of eval() too large", 0.02, eval=larger)
 def energy(law: Law, case: Case) -> None:
     """The albedo ∫ f |cos θo| dωo is at most 1, and the same by samples and by quadrature.
 

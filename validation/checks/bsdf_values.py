@@ -12,6 +12,16 @@ import numpy as np
 from mrt_mitsuba.validation.checks import bsdf_case, noise, probe
 from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
+from mrt_mitsuba.validation.checks.faults import (
+    GLASS,
+    GLOSS,
+    larger,
+    member,
+    no_number,
+    of_sample,
+    of_weight,
+    put,
+)
 from mrt_mitsuba.validation.checks.law import (
     Figure,
     Law,
@@ -19,13 +29,24 @@ from mrt_mitsuba.validation.checks.law import (
     at_least,
     at_most,
     figures,
-    judge_many,
+    finds,
     most,
     number_of,
 )
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar
+from mrt_mitsuba.validation.checks.subject import judge_many
 
 TWO_WAYS = "two ways to the same number"
+
+
+def first_channel(size, pair, *_):
+    value, pdf = pair
+    return value * mi.Color3f(1 + size, 1, 1), pdf
+
+
+def density_of_pair(size, pair, *_):
+    value, pdf = pair
+    return value, (1 + size) * pdf
 
 
 @figures(
@@ -38,6 +59,8 @@ TWO_WAYS = "two ways to the same number"
         VALUE,
     ),
 )
+@finds("value", "value of eval_pdf() too large in one channel", 1e-4, pair=first_channel)
+@finds("density", "density of eval_pdf() too large", 2e-4, nested=GLOSS, pair=density_of_pair)
 def eval_pdf(law: Law, case: Case) -> None:
     """``eval_pdf`` is ``eval`` and ``pdf``; both ways to a value are 0 where ``active`` is False.
 
@@ -75,6 +98,19 @@ for u in (({u}), ({back})):
 EITHER_WAY = "light can be followed either way; transmitted radiance scales by the squared index"
 
 
+def with_cosine(size, value, ctx, wi, wo):
+    return value * (1 + size * wi.z)
+
+
+def from_one_side(size, value, ctx, wi, wo):
+    return value * (1 + size * (wi.z > 0))
+
+
+def by_mode(size, value, ctx, *_):
+    """Larger in the mode of importance."""
+    return value * (1 + size * (ctx.mode == mi.TransportMode.Importance))
+
+
 @figures(
     swapped=most(f"f(wi, wo) against f(wo, wi), {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY),
     modes=most(
@@ -100,6 +136,11 @@ EITHER_WAY = "light can be followed either way; transmitted radiance scales by t
         THERE_AND_BACK,
     ),
 )
+@finds("swapped", "value that grows with the cosine of wi", 3e-3, value=with_cosine)
+@finds("modes", "more light in the mode of importance", 3e-3, value=by_mode)
+@finds("medium", "index of refraction of reflected light", 3e-7, sample=of_sample(member("eta", larger)))
+@finds("single", "more light through glass from one side", 3e-3, nested=GLASS, value=from_one_side)
+@finds("single_modes", "more light through glass by importance", 3e-3, nested=GLASS, value=by_mode)
 def reciprocity(law: Law, case: Case) -> None:
     """f(ωi, ωo) η_o² = f(ωo, ωi) η_i², with the indices of the media that the directions are in.
 
@@ -175,6 +216,18 @@ WRONG = "results not finite, or negative{where}: {faults}"
 SPOILS = "one such number spoils a picture"
 
 
+def no_number_at_the_end(size, weight, u):
+    return dr.select(u.x > 1 - size, dr.nan, weight)
+
+
+def no_direction(size, bs, weight, u, _):
+    return put(bs, wo=no_number(size, bs.wo, u)), weight
+
+
+def negative_next_to_normal(size, value, ctx, wi, wo):
+    return dr.select(dr.minimum(wi.z, wo.z) > 1 - size, -1, 1) * value
+
+
 @figures(
     values=number_of(WRONG, 0, SPOILS, VALUE),
     samples=number_of(WRONG, 0, SPOILS, SAMPLE),
@@ -185,6 +238,10 @@ SPOILS = "one such number spoils a picture"
         SAMPLE,
     ),
 )
+@finds("samples", "NaN for the last random numbers, this share", 1e-6, sample=of_weight(no_number_at_the_end))
+@finds("million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=of_weight(no_number))
+@finds("million", "direction NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=no_direction)
+@finds("values", "negative value where both cosines are so near to 1", 1e-6, value=negative_next_to_normal)
 def finite(law: Law, case: Case) -> None:
     """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
     extremes = _extremes(case)
@@ -276,6 +333,11 @@ NOISE = """for k in range(9):  # float32 steps in all components: a smooth funct
 """
 
 
+def stairs_on_slope(size, value, ctx, wi, wo):
+    slope = wi.z * wo.z / size
+    return value * (1 + size * (dr.round(slope) - slope))
+
+
 @figures(
     lost=Figure(
         0.9,
@@ -285,6 +347,7 @@ NOISE = """for k in range(9):  # float32 steps in all components: a smooth funct
         NOISE,
     )
 )
+@finds("lost", "stairs on a slope, of this height", 3e-4, value=stairs_on_slope)
 def roundoff(law: Law, case: Case) -> None:
     """Noise of float32 evaluation beyond what the rounding of the directions explains (``noise``)."""
     case.need_smooth()

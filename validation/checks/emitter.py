@@ -1,10 +1,8 @@
-"""``check_emitter``: the laws that any emitter must obey, stock or in Python.
-
-A new law is a function of ``Law`` and ``Case`` and a row of ``LAWS``; see ``bsdf``.
-"""
+"""``check_emitter``: the laws that any emitter must obey, stock or in Python; see ``bsdf``."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
 from functools import cached_property, partial
 
@@ -16,23 +14,22 @@ from scipy import stats
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import probe
+from mrt_mitsuba.validation.checks.examine import TIMEOUT, Check, examine
+from mrt_mitsuba.validation.checks.faults import DEGREE, PLACE, larger, no_number, put
 from mrt_mitsuba.validation.checks.law import (
-    TIMEOUT,
-    Check,
-    Given,
     Law,
     Skip,
-    Subject,
     at_most,
-    examine,
     figures,
-    judge_many,
+    finds,
+    laws_in,
     most,
     number_of,
     rare,
 )
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, excess, lanes
 from mrt_mitsuba.validation.checks.sphere import Cells, chances_of, chi_square, encode, integrate, small_cells
+from mrt_mitsuba.validation.checks.subject import Given, Subject, judge_many
 from mrt_mitsuba.validation.tools.compare import sidak
 
 SAME = 1e-3  # relative: the same formula, evaluated once more
@@ -184,6 +181,7 @@ def _seen_from(p: mi.Point3f) -> mi.SurfaceInteraction3f:
 
 
 @figures(same=most(f"density of a direction against pdf_direction(), {BEYOND}", SAME, "one number"))
+@finds("same", "pdf_direction() too large", 3e-3, pdf=larger)
 def density(law: Law, case: Case) -> None:
     """The density that a sample states is ``pdf_direction``."""
     s = case.samples
@@ -191,6 +189,30 @@ def density(law: Law, case: Case) -> None:
     if not judged.any():
         raise Skip("light comes from single directions (delta), or none was sampled")
     law.hold("same", excess(s.pdf, s.again, case.spread[0])[judged])
+
+
+def in_hole(size, d):
+    """Directions in a cone, so many degrees across."""
+    return dr.norm(d - mi.Vector3f(PLACE)) < size * DEGREE / 2
+
+
+def around_hole(size, ds, u):
+    """Directions that are never in a cone: they go the other way."""
+    d = dr.select(in_hole(size, ds.d), -ds.d, ds.d)
+    return put(ds, p=ds.p + ds.dist * (d - ds.d), d=d)
+
+
+def refused_in_hole(size, weight, u, ds):
+    return dr.select(in_hole(size, ds.d), 0, weight)
+
+
+def no_density_in_hole(size, pdf, ds):
+    return dr.select(in_hole(size, ds.d), 0, pdf)
+
+
+def no_density_of_sample(size, ds, u):
+    ds = around_hole(size, ds, u)
+    return put(ds, pdf=no_density_in_hole(size, ds.pdf, ds))
 
 
 @figures(
@@ -205,6 +227,15 @@ def density(law: Law, case: Case) -> None:
         DARK,
         "light that samples never find is missing from the picture",
     ),
+)
+@finds("small", "no samples in a cone, in degrees", 3, direction=around_hole)
+@finds("small", "samples without weight in a cone, in degrees", 3, weight=refused_in_hole)
+@finds(
+    "dark",
+    "no density in a cone, in degrees",
+    3,
+    direction=no_density_of_sample,
+    pdf=no_density_in_hole,
 )
 def sampling(law: Law, case: Case) -> None:
     """p = o + dist · d; light from all around follows its density (Pearson's χ²)."""
@@ -289,6 +320,7 @@ def _directions(case: Case, u: Array) -> Array:
     weight=most(f"weight against eval_direction() / density, {BEYOND}", SAME, "one number"),
     seen=most(f"eval() where it is seen against eval_direction(), {BEYOND}", SAME, "one number"),
 )
+@finds("weight", "weight of a sample too large", 3e-3, weight=larger)
 def weights(law: Law, case: Case) -> None:
     """weight · pdf = ``eval_direction`` = what is seen there."""
     s = case.samples
@@ -311,6 +343,7 @@ def weights(law: Law, case: Case) -> None:
         SPOILS,
     ),
 )
+@finds("million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number)
 def finite(law: Law, case: Case) -> None:
     """All numbers of samples are finite, directions one unit long, weights and densities not negative."""
     s = case.samples
@@ -331,5 +364,4 @@ def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[
     return probe.not_finite(weight, least=0) | (lit & read), {}
 
 
-_ALL = (density, sampling, weights, finite)
-LAWS = {law.__name__: law for law in _ALL}
+LAWS = laws_in(sys.modules[__name__])

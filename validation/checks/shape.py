@@ -1,30 +1,16 @@
-"""``check_shape``: the laws that any shape must obey, stock, mesh or in Python.
-
-A new law is a function of ``Law`` and ``Case`` in a module next to this one, and a row of ``LAWS``; see
-``bsdf``.
-"""
+"""``check_shape``: the laws that any shape must obey, stock, mesh or in Python; see ``bsdf``."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mrt_mitsuba.validation.checks.law import TIMEOUT, Check, Given, examine
+from mrt_mitsuba.validation.checks import shape_hits, shape_samples
+from mrt_mitsuba.validation.checks.examine import TIMEOUT, Check, examine
+from mrt_mitsuba.validation.checks.law import laws_in
 from mrt_mitsuba.validation.checks.shape_case import Case
-from mrt_mitsuba.validation.checks.shape_hits import (
-    bbox,
-    far,
-    finite,
-    hits,
-    normals,
-    scale,
-    surface,
-    variants,
-    watertight,
-)
-from mrt_mitsuba.validation.checks.shape_samples import sampling
+from mrt_mitsuba.validation.checks.subject import Given
 
-_ALL = (hits, surface, normals, watertight, scale, far, finite, sampling, bbox, variants)
-LAWS = {law.__name__: law for law in _ALL}
+LAWS = laws_in(shape_hits, shape_samples)
 
 
 def check_shape(

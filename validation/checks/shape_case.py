@@ -10,12 +10,8 @@ import numpy as np
 from numpy.linalg import norm
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks import law as laws
-from mrt_mitsuba.validation.checks.law import (
-    Given,
-    Skip,
-    Subject,
-)
+from mrt_mitsuba.validation.checks import subject
+from mrt_mitsuba.validation.checks.law import Skip
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import (
     Array,
@@ -23,6 +19,7 @@ from mrt_mitsuba.validation.checks.probe import (
     lanes,
     unit,
 )
+from mrt_mitsuba.validation.checks.subject import Given, Subject
 
 OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
 FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
@@ -88,7 +85,7 @@ class Case(Subject):
             kind = type(self.plugin).__name__
             raise UsageError(f"{kind} is not a shape of {mi.variant()}: give a dict or a loaded shape")
         self.target = self.plugin
-        if laws.class_name(self.plugin) == "Instance":
+        if subject.class_name(self.plugin) == "Instance":
             if self.description is None:
                 raise UsageError("a loaded instance does not give its group away: give a dict of both")
             self.target = self.scene()
@@ -184,8 +181,8 @@ def _refused(shape: mi.Shape) -> str:
     if not stock or "to_world" not in params:
         return ""
     matrix = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
-    kind = laws.class_name(shape).lower()
-    return laws.refused({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
+    kind = subject.class_name(shape).lower()
+    return subject.refused({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
 
 
 def offset(p: Array) -> Array:

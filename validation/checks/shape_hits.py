@@ -12,8 +12,8 @@ import numpy as np
 from numpy.linalg import norm
 from scipy import stats
 
-from mrt_mitsuba.validation.checks import law as laws
-from mrt_mitsuba.validation.checks import noise
+from mrt_mitsuba.validation.checks import noise, subject
+from mrt_mitsuba.validation.checks.faults import SIZE, larger, member, off_surface, put, tilted
 from mrt_mitsuba.validation.checks.law import (
     LEVEL,
     Figure,
@@ -21,6 +21,7 @@ from mrt_mitsuba.validation.checks.law import (
     Skip,
     at_most,
     figures,
+    finds,
     most,
     number_of,
     share_of,
@@ -57,10 +58,20 @@ print("up to", ray.maxt, "ray_test():", scene.ray_test(ray), "ray_intersect():",
 ONE = "one question, one answer; of rays that graze, only those that just miss count"
 
 
+def in_share(size, ray):
+    """Rays of a share of the directions."""
+    return ray.d.x > 1 - 2 * size
+
+
+def missed_in_share(size, met, ray):
+    return met & ~in_share(size, ray)
+
+
 @figures(
     ray_test=share_of("share of rays {rays} on which ray_test() is wrong", 0, ONE, MAXT),
     ray_intersect=share_of("share of rays {rays} on which ray_intersect() is wrong", 0, ONE, MAXT),
 )
+@finds("ray_test", "ray_test() misses in this share of directions", 1e-5, ray_test=missed_in_share)
 def hits(law: Law, case: Case) -> None:
     """``ray_test`` and ``ray_intersect`` agree, and respect ``maxt``, from outside and from the surface."""
     away = case.units(len(case.met.t))
@@ -85,6 +96,23 @@ def _answers(law: Law, case: Case, rays: str, seen: Lanes, reach: float) -> None
     for name, answer in zip(("ray_test", "ray_intersect"), answers, strict=True):
         wrong = (~seen.met | seen.steep) & (answer != (seen.met & (reach > 1)))
         law.hold(name, wrong, seen, limit=limit, maxt=maxt, rays=rays)
+
+
+def too_far(size, si, ray):
+    return put(si, t=si.t + SIZE * size, p=si.p + SIZE * size * ray.d)
+
+
+def missed(where):
+    """A change of hits that are missed in some places."""
+
+    def apply(size, si, ray):
+        return put(si, t=dr.select(where(size, si, ray), dr.inf, si.t))
+
+    return apply
+
+
+def close(size, si, ray):
+    return (si.t < 0.01) & in_share(size, ray)
 
 
 @figures(
@@ -129,6 +157,10 @@ def _answers(law: Law, case: Case, rays: str, seen: Lanes, reach: float) -> None
         RAY,
     ),
 )
+@finds("on_ray", "hit points off the ray, in sizes", 1e-5, ray_intersect=off_surface)
+@finds("near_by", "hit points off, in sizes", 5e-7, ray_intersect=off_surface)
+@finds("behind", "hits too far away, in sizes", 5e-7, ray_intersect=too_far)
+@finds("missed", "a least distance for this share of directions", 3e-3, ray_intersect=missed(close))
 def surface(law: Law, case: Case) -> None:
     """p = o + t d is on the surface; spawned rays do not meet it where they start; digits are kept."""
     met = case.met
@@ -214,6 +246,15 @@ print("step", step, "by partial derivatives:", si.dp_du * uv.x + si.dp_dv * uv.y
 PARTED = "extrapolated to no step; edges may part neighbours"
 
 
+def tilted_frame(size, frame):
+    return mi.Frame3f(tilted(size, frame.n))
+
+
+def inwards(size, si, ray):
+    turned = (si.p.x > 1 - 2 * size) & (si.n.x < 0.5)
+    return put(si, n=dr.select(turned, -1, 1) * si.n)
+
+
 @figures(
     outwards=share_of(
         "share of rays from outside whose normal points the wrong way",
@@ -249,6 +290,12 @@ PARTED = "extrapolated to no step; edges may part neighbours"
         0.95, "step along the surface less its partial derivatives, 95 in 100", 1e-2, PARTED, NEIGHBOUR
     ),
 )
+@finds("outwards", "normals inwards on this share of most faces", 3e-3, ray_intersect=inwards)
+@finds("length", "normals too long", 3e-5, ray_intersect=member("n", larger))
+@finds("slant", "normals tilted, in radians", 3e-3, ray_intersect=member("n", tilted))
+@finds("slope", "normals tilted as well as derivatives, in radians", 0.03, ray_intersect=member("n", tilted))
+@finds("shading", "shading normals tilted, in radians", 3e-3, ray_intersect=member("sh_frame", tilted_frame))
+@finds("step", "dp_du too long", 0.02, ray_intersect=member("dp_du", larger))
 def normals(law: Law, case: Case) -> None:
     """n has unit length, points outwards, n · ∂p/∂u = n · ∂p/∂v = 0, and differences of points agree."""
     if case.closed:
@@ -262,7 +309,7 @@ def normals(law: Law, case: Case) -> None:
     law.hold("length", abs(length - 1).max(axis=0), met)
     law.hold("side", dot(met.n, met.shading) <= 0, met)
     smoothed = isinstance(case.plugin, mi.Mesh) and case.plugin.has_vertex_normals()
-    if not smoothed and laws.class_name(case.plugin) not in SMOOTHED:
+    if not smoothed and subject.class_name(case.plugin) not in SMOOTHED:
         law.hold("shading", norm(met.shading - met.n, axis=1), met)
     # the normal is the surface's, not the ray's: the same for a ray that comes back from behind
     back = case.behind
@@ -298,6 +345,14 @@ def _differences(law: Law, case: Case) -> None:
             law.hold(name, np.maximum(2 * narrow - wide, 0), met, aside=aside, size=case.size)
 
 
+def slit(size, si, ray):
+    return dr.abs(si.p.x - 0.3) < SIZE * size / 2
+
+
+def slit_above(size, si, ray):
+    return slit(size, si, ray) & (si.n.z > 0.5)
+
+
 @figures(
     blind=share_of(
         "share of rays that pass the surface from behind", 1e-2, "it has two sides; edges have room", RAY
@@ -315,6 +370,8 @@ def _differences(law: Law, case: Case) -> None:
         RAY,
     ),
 )
+@finds("out", "a slit of this width, in sizes", 3e-5, quick=1e-4, ray_intersect=missed(slit))
+@finds("odd", "a slit of this width in one face, in sizes", 6e-3, ray_intersect=missed(slit_above))
 def watertight(law: Law, case: Case) -> None:
     """Lines enter and leave in turn, and no ray from inside gets out without a hit."""
     met = case.met
@@ -402,6 +459,14 @@ TWICE = """for o in (o, mi.Point3f({other})):
 """
 
 
+def off_from_afar(size, si, ray):
+    return put(si, p=dr.select(si.t > 1000, si.p + size * si.t * si.n, si.p))
+
+
+def afar(size, si, ray):
+    return (si.t > 1000) & in_share(size, ray)
+
+
 @figures(
     missed=share_of(
         "share of rays from afar that miss what is met from nearby, or meet it "
@@ -411,6 +476,8 @@ TWICE = """for o in (o, mi.Point3f({other})):
         TWICE,
     ),
 )
+@finds("missed", "hits off by this part of a distance above a thousand", 1e-5, ray_intersect=off_from_afar)
+@finds("missed", "misses from afar in this share of directions", 3e-3, ray_intersect=missed(afar))
 def far(law: Law, case: Case) -> None:
     """Hits from ten thousand sizes away are those of the same lines from nearby, to some roundings."""
     met = case.met.only(slice(0, case.count(2**12, 2**15)))
@@ -434,6 +501,16 @@ def far(law: Law, case: Case) -> None:
     law.hold("missed", bad, there, other=closer)
 
 
+def no_number_along_axis(size, si, ray):
+    return put(si, uv=dr.select(dr.abs(ray.d.x) < size, dr.nan, si.uv))
+
+
+def no_number_in_place(size, si, ray):
+    """NaN for about a share of the rays, in one direction."""
+    inside = (ray.d.x > 0.3) & (ray.d.x < 0.3 + 2 * size)
+    return put(si, uv=dr.select(inside, dr.nan, si.uv))
+
+
 @figures(
     bad=number_of("hits with numbers that are not finite", 0, "one NaN spoils a picture", RAY),
     million=at_most(
@@ -443,6 +520,8 @@ def far(law: Law, case: Case) -> None:
         RAY,
     ),
 )
+@finds("bad", "NaN where a component of the direction is so small", 1e-12, ray_intersect=no_number_along_axis)
+@finds("million", "NaN for a share of the rays", 2e-6, quick=2e-5, ray_intersect=no_number_in_place)
 def finite(law: Law, case: Case) -> None:
     """Rays along axes, from the surface, the middle, corners and very far: all results are finite."""
     met = case.met
@@ -468,7 +547,7 @@ def finite(law: Law, case: Case) -> None:
     numbers = np.concatenate([hits.t[:, None], *vectors], axis=1)
     sound = np.isfinite(numbers).all(axis=1) & (hits.t >= 0)
     law.hold("bad", np.where(hits.met, ~sound, np.isnan(hits.t)), hits)  # a miss is infinitely far
-    laws.judge_many(law, case, partial(_at_random, case))
+    subject.judge_many(law, case, partial(_at_random, case))
 
 
 def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
@@ -487,9 +566,19 @@ def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[
     return bad, {"o": o, "d": d}
 
 
+def lower_top(size, box):
+    return mi.BoundingBox3f(box.min, (1 - 2 * size) * box.max)
+
+
+def higher_bottom(size, box):
+    return mi.BoundingBox3f((1 - 2 * size) * box.min, box.max)
+
+
 @figures(
     outside=at_most("points outside the bounding box, in sizes", 1e-5, "some roundings", RAY),
 )
+@finds("outside", "a box too small above, in sizes", 3e-5, bbox=lower_top)
+@finds("outside", "a box too small below, in sizes", 3e-5, bbox=higher_bottom)
 def bbox(law: Law, case: Case) -> None:
     """Whatever is hit or sampled lies in the bounding box."""
     met = case.met

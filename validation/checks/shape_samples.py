@@ -9,7 +9,18 @@ import mitsuba as mi
 import numpy as np
 from numpy.linalg import norm
 
-from mrt_mitsuba.validation.checks.law import SIGMAS, Figure, Law, at_most, figures, most, rare, share_of
+from mrt_mitsuba.validation.checks.faults import larger, member, off_surface, put, smaller, tilted
+from mrt_mitsuba.validation.checks.law import (
+    SIGMAS,
+    Figure,
+    Law,
+    at_most,
+    figures,
+    finds,
+    most,
+    rare,
+    share_of,
+)
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import (
     Array,
@@ -38,6 +49,34 @@ ratio = shape.pdf_position(ps) / ps.pdf
 print("pdf_position() / density:", dr.min(ratio), "...", dr.max(ratio))
 """
 SAME = "the same number"
+
+
+def crowded(size, ps, time, u):
+    """Positions on a square, crowded to one side."""
+    return put(ps, p=mi.Point3f(2 * u.x ** (1 + size) - 1, ps.p.y, 0))
+
+
+def crowded_azimuth(size, ps, time, u):
+    """Positions on a unit sphere, crowded to one azimuth."""
+    azimuth = 2 * dr.pi * u.y ** (1 + size)
+    radius = dr.hypot(ps.p.x, ps.p.y)
+    p = mi.Point3f(radius * dr.cos(azimuth), radius * dr.sin(azimuth), ps.p.z)
+    return put(ps, p=p, n=mi.Normal3f(p))
+
+
+def crowded_directions(size, ds, it, u):
+    """Directions turned around the one to the middle, to crowd at one azimuth."""
+    frame = mi.Frame3f(dr.normalize(-mi.Vector3f(it.p)))
+    local = frame.to_local(ds.d)
+    turn = dr.atan2(local.y, local.x) / (2 * dr.pi) + 0.5
+    azimuth = 2 * dr.pi * turn ** (1 + size)
+    radius = dr.hypot(local.x, local.y)
+    d = frame.to_world(mi.Vector3f(radius * dr.cos(azimuth), radius * dr.sin(azimuth), local.z))
+    return put(ds, d=d, p=it.p + ds.dist * d)
+
+
+def too_short(size, ds, it, u):
+    return put(ds, dist=ds.dist * dr.select(u.x < size, 0.99, 1))
 
 
 @figures(
@@ -87,6 +126,53 @@ SAME = "the same number"
         "the mean of 1 / density over what is seen; lines that graze are left room for",
         POSITIONS,
     ),
+)
+@finds(
+    "crossings",
+    "area too large, and the density of positions too small",
+    0.01,
+    quick=0.02,
+    surface_area=larger,
+    pdf_position=smaller,
+    sample_position=member("pdf", smaller),
+)
+@finds("area", "surface_area() too large", 3e-3, surface_area=larger)
+@finds("position", "pdf_position() too large", 3e-3, pdf_position=larger)
+@finds(
+    "spread",
+    "positions crowded to one side: u^(1 + this)",
+    0.03,
+    quick=0.1,
+    nested={"type": "rectangle"},
+    sample_position=crowded,
+)
+@finds(
+    "spread",
+    "positions on a sphere crowded at one azimuth: u^(1 + this)",
+    0.03,
+    quick=0.1,
+    nested={"type": "sphere"},
+    sample_position=crowded_azimuth,
+)
+@finds("off", "positions off the surface, in sizes", 1e-5, sample_position=off_surface)
+@finds("normal", "normals of positions tilted, in radians", 0.1, sample_position=member("n", tilted))
+@finds("direction", "pdf_direction() too large", 0.02, pdf_direction=larger)
+@finds("misses", "distances too short for this share of directions", 0.02, sample_direction=too_short)
+@finds(
+    "aim",
+    "directions to a sphere crowded at one azimuth: u^(1 + this)",
+    0.05,
+    quick=0.1,
+    nested={"type": "sphere"},
+    sample_direction=crowded_directions,
+)
+@finds(
+    "angle",
+    "density of directions too small",
+    0.03,
+    quick=0.2,
+    pdf_direction=smaller,
+    sample_direction=member("pdf", smaller),
 )
 def sampling(law: Law, case: Case) -> None:
     """Positions by area, judged by where lines cross the surface; directions, and the densities of both.
