@@ -16,8 +16,9 @@ from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.validation.checks import emitter as emitters
 from mrt_mitsuba.validation.checks import scene as checks
 from mrt_mitsuba.validation.checks.examine import Check
+from mrt_mitsuba.validation.checks.faults import put
 from mrt_mitsuba.validation.studies import power
-from mrt_mitsuba.validation.studies.power import changed_bsdf, changed_sky, put
+from mrt_mitsuba.validation.studies.power import changed_bsdf, changed_sky
 
 pytestmark = pytest.mark.usefixtures("variant")
 

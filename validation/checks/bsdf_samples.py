@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -20,12 +22,13 @@ from mrt_mitsuba.validation.checks.faults import (
     put,
     smaller,
 )
-from mrt_mitsuba.validation.checks.law import SIGMAS, Law, at_most, figures, finds, most, rare, share_of
+from mrt_mitsuba.validation.checks.law import SIGMAS, Law, figures, finds, most, number_of, rare, share_of
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
 from mrt_mitsuba.validation.checks.sphere import (
     Cells,
     chi_square,
     encode,
+    hold_small,
     integrate,
     small_cells,
 )
@@ -90,7 +93,7 @@ def stairs_of(size, u):
         "directions fill the sphere, in two dimensions; stairs in random numbers show as patterns",
         NUDGED,
     ),
-    dark=at_most(
+    dark=number_of(
         "share of the light that comes from directions whose pdf() is 0",
         1e-4,
         "light that samples never find is missing from the picture",
@@ -160,30 +163,22 @@ def _without_density(law: Law, case: Case) -> None:
     rng = np.random.default_rng((case.seed, count))
     wi, wo = probe.unit(rng.normal(size=(2, count, 3)))
     uv = rng.random((count, 2), np.float32)
-    value, pdf = case.both(wi, wo, uv)
-    light = np.nan_to_num(value, posinf=0, neginf=0).sum(axis=1)
-    missing = np.where(pdf == 0, light, 0)
-    if light.sum() > 0:
-        i = missing.argmax()
-        law.hold("dark", missing.sum() / light.sum(), wi=wi[i], wo=wo[i], uv=uv[i])
+    law.hold("dark", probe.without_density(*case.both(wi, wo, uv)), wi=wi, wo=wo, uv=uv)
 
 
 def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
     cells = small_cells()
-    wo, omega = cells.points(case.rng)
-    seen = np.zeros(len(omega))
-    expected = np.zeros(len(omega))
-    variance = np.zeros(len(omega))
+    seen = np.zeros(len(cells.start))
+    expected = np.zeros(len(cells.start))
+    variance = np.zeros(len(cells.start))
     for view in views:
         seen += cells.counts(view.samples.wo[view.density > 0])
-        pdf = case.pdf(view.wi, wo.reshape(-1, 3), view.uv).reshape(omega.shape) * omega
-        count = len(view.density) * omega.shape[1]
-        expected += count * pdf.mean(axis=1)
-        variance += count**2 * pdf.var(axis=1) / (omega.shape[1] - 1)
+        share, doubt = cells.integrals(partial(case.pdf, view.wi, uv=view.uv), case.rng)
+        count = len(view.density)
+        expected += count * share[:, 0]
+        variance += count**2 * doubt[:, 0]
     view = max(views, key=lambda v: v.wi[2])
-    chance, cell = cells.rarest(seen, expected, variance, FIT)
-    law.hold("small", chance, wi=view.wi, uv=view.uv, cell=cells.bounds(cell))
-    law.hold("slices", cells.rarest_slice(seen, expected, variance, FIT), wi=view.wi, uv=view.uv)
+    hold_small(law, cells, seen, expected, variance, FIT, wi=view.wi, uv=view.uv)
 
 
 def weight_in_stairs(size, weight, u):

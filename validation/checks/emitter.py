@@ -28,7 +28,15 @@ from mrt_mitsuba.validation.checks.law import (
     rare,
 )
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, excess, lanes
-from mrt_mitsuba.validation.checks.sphere import Cells, chances_of, chi_square, encode, integrate, small_cells
+from mrt_mitsuba.validation.checks.sphere import (
+    Cells,
+    chances_of,
+    chi_square,
+    encode,
+    hold_small,
+    integrate,
+    small_cells,
+)
 from mrt_mitsuba.validation.checks.subject import Given, Subject, judge_many
 from mrt_mitsuba.validation.tools.compare import sidak
 
@@ -222,7 +230,7 @@ def no_density_of_sample(size, ds, u):
     counts=rare("chance of such counts if directions follow pdf_direction()"),
     small=rare("chance of such counts in cells of a degree, for their number"),
     slices=rare("chance of such counts in slices of a degree or two, for their number"),
-    dark=at_most(
+    dark=number_of(
         "share of the light, from all around, whose density is 0",
         DARK,
         "light that samples never find is missing from the picture",
@@ -268,9 +276,7 @@ def _without_density(law: Law, case: Case) -> None:
     rng = np.random.default_rng((case.seed, 2))
     d = probe.unit(rng.normal(size=(case.count(2**18, 2**20), 3)))
     pdf, value = case.seen(d)
-    light = np.nan_to_num(value, posinf=0, neginf=0).sum(axis=1)
-    if light.sum() > 0:
-        law.hold("dark", light[pdf == 0].sum() / light.sum())
+    law.hold("dark", probe.without_density(value, pdf))
 
 
 def _in_small_cells(law: Law, case: Case) -> None:
@@ -281,25 +287,13 @@ def _in_small_cells(law: Law, case: Case) -> None:
     seen = np.zeros(len(cells.start))
     for _ in range(count // 2**20):
         seen += cells.counts(_directions(case, rng.random((2**20, 2), np.float32)))
-    share, variance = _shares(case, cells, rng)
+    share, variance = cells.integrals(case.density, rng)
     # a corner of a bright texel may lie between the points of a cell
-    doubtful = chances_of(seen, count * share, count**2 * variance, SAME) < DOUBT
+    doubtful = chances_of(seen, count * share[:, 0], count**2 * variance[:, 0], SAME) < DOUBT
     if doubtful.any():
-        again = [_shares(case, cells.only(doubtful), rng) for _ in range(REPEATS)]
+        again = [cells.only(doubtful).integrals(case.density, rng) for _ in range(REPEATS)]
         share[doubtful], variance[doubtful] = np.mean(again, axis=0)
-    expected = count * share
-    variance = count**2 * variance
-    chance, _ = cells.rarest(seen, expected, variance, SAME)
-    law.hold("small", chance)
-    law.hold("slices", cells.rarest_slice(seen, expected, variance, SAME))
-
-
-def _shares(case: Case, cells: Cells, rng: np.random.Generator) -> tuple[Array, Array]:
-    """The integrals of the density over cells, and their variances. [C], [C]"""
-    wo, omega = cells.points(rng)
-    points = omega.shape[1]
-    pdf = case.density(wo.reshape(-1, 3)).reshape(omega.shape) * omega * points
-    return pdf.mean(axis=1), pdf.var(axis=1) / (points - 1)
+    hold_small(law, cells, seen, count * share[:, 0], count**2 * variance[:, 0], SAME)
 
 
 def _directions(case: Case, u: Array) -> Array:

@@ -233,6 +233,12 @@ def spread(
     return largest
 
 
+def without_density(value: Array, pdf: Array) -> Array:
+    """The share of all light [N, channels] that each direction carries, where its density [N] is 0. [N]"""
+    light = np.nan_to_num(value, posinf=0, neginf=0).sum(axis=1)
+    return np.where(pdf == 0, light, 0) / max(light.sum(), 1e-30)
+
+
 def excess(one: Array, other: Array, allowed: Array | float = 0.0) -> Array:
     """How far two arrays [N, …] differ [N], beyond ``8 * allowed``, relative to the larger one.
 

@@ -7,11 +7,13 @@ Morton code at which it starts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
+from mrt_mitsuba.validation.checks.law import Law
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, joined
 from mrt_mitsuba.validation.tools.compare import sidak
 
@@ -126,32 +128,18 @@ class Cells(Lanes):
         """How many of the directions [N, 3] lie in each cell. [C]"""
         return np.bincount(self.find(encode(wo)), minlength=len(self.start))
 
-    def rarest(self, seen: Array, expected: Array, variance: Array, known: float) -> tuple[float, int]:
-        """The least chance of what is ``seen`` in a cell, for their number, and the cell.
+    def integrals(self, function: Callable[[Array], Array], rng: np.random.Generator) -> tuple[Array, Array]:
+        """Integrals of ``function(directions [N, 3]) -> [N, K]`` over cells, and their variances. [C, K]"""
+        wo, omega = self.points(rng)
+        values = function(wo.reshape(-1, 3)).reshape(*omega.shape, -1) * omega[..., None] * POINTS
+        return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
 
-        ``variance``: of ``expected``; ``known``: to how much densities are known, relative.
-        """
-        chances = chances_of(seen, expected, variance, known)
-        return sidak(chances.min(), 2 * len(chances)), int(chances.argmin())
-
-    def rarest_slice(self, seen: Array, expected: Array, variance: Array, known: float) -> float:
-        """The same for rows of cells of one r or azimuth, and slices along x and y."""
+    def rows(self) -> Iterator[Array]:
+        """For each cell [C] the number of its row: of one r or azimuth, or in slices along x and y."""
         r, turn = self.corner
         x, y, _ = self.middle.T
-        sound = np.isfinite(expected)
-        seen = np.where(sound, seen, 0)
-        expected = np.where(sound, expected, 0)
-        variance = np.where(sound, variance, 0)
-        least = 1.0
-        tests = 0
         for place in (r, turn, 0.5 + 0.4999 * x, 0.5 + 0.4999 * y):
-            row = np.floor(place / self.width).astype(int) * 2 + self.below
-            chances = chances_of(
-                np.bincount(row, seen), np.bincount(row, expected), np.bincount(row, variance), known
-            )
-            least = min(least, chances.min())
-            tests += 2 * len(chances)
-        return sidak(least, tests)
+            yield np.floor(place / self.width).astype(int) * 2 + self.below
 
 
 def small_cells() -> Cells:
@@ -159,13 +147,31 @@ def small_cells() -> Cells:
     return Cells.around(np.zeros(0, np.int64), 0, SMALL)
 
 
+def hold_small(
+    law: Law, cells: Cells, seen: Array, expected: Array, variance: Array, known: float, **names: Any
+) -> None:
+    """Hold ``small`` to the least chance of what is ``seen`` in cells, and ``slices`` to that in their rows.
+
+    ``variance``: of ``expected``; ``known``: to how much densities are known, relative.
+    """
+    # where densities are not finite, the law ``finite`` says so
+    seen, expected, variance = np.where(np.isfinite(expected), [seen, expected, variance], 0)
+    chances = chances_of(seen, expected, variance, known)
+    cell = cells.bounds(chances.argmin())
+    law.hold("small", sidak(chances.min(), 2 * len(chances)), cell=cell, **names)
+    rows = []
+    for row in cells.rows():
+        rows.append(chances_of(*(np.bincount(row, x) for x in (seen, expected, variance)), known))
+    chances = np.concatenate(rows)
+    law.hold("slices", sidak(chances.min(), 2 * len(chances)), **names)
+
+
 def chances_of(seen: Array, expected: Array, variance: Array, known: float) -> Array:
-    """Chances of so many or so few where a Poisson distribution expects as many; 1 where that is unknown."""
+    """The chances of so many or so few where a Poisson distribution expects as many."""
     room = 3 * np.sqrt(variance) + known * expected  # is not Poisson's
     many = stats.poisson.sf(seen - 1, expected + room)
     few = stats.poisson.cdf(seen, expected - room)
-    either = np.minimum(many, np.where(expected > room, few, 1))
-    return np.where(np.isfinite(expected), either, 1)
+    return np.minimum(many, np.where(expected > room, few, 1))
 
 
 def in_order(parts: Sequence[Cells]) -> Cells:
@@ -188,6 +194,10 @@ def integrate(
     are made as certain as so many samples would be. The cells returned have the ``mean`` of each estimate and
     its ``variance``, both [C, K].
     """
+
+    def finite(wo: Array) -> Array:
+        return np.nan_to_num(function(wo), posinf=0, neginf=0)
+
     done = []
     order = np.argsort(codes)
     codes = codes[order]
@@ -195,11 +205,7 @@ def integrate(
     for attempt in range(ATTEMPTS):
         first, last = below[np.searchsorted(codes, [cells.start, cells.end])]
         by_samples = last - first
-        wo, omega = cells.points(rng)
-        values = np.nan_to_num(function(wo.reshape(-1, 3)), posinf=0, neginf=0)
-        values = values.reshape(*omega.shape, -1) * omega[..., None] * POINTS
-        mean = values.mean(axis=1)
-        variance = values.var(axis=1) / (POINTS - 1)
+        mean, variance = cells.integrals(finite, rng)
         total = abs(mean).sum(axis=0) + 1e-12
         # half of what chance does to the count of the samples, or one sample, is known well enough
         enough = 0.25 * abs(mean) / total / samples + 1 / samples**2

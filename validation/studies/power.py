@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,7 +15,7 @@ from mrt_mitsuba.validation.checks import bsdf, emitter, shape
 from mrt_mitsuba.validation.checks.bsdf import check_bsdf
 from mrt_mitsuba.validation.checks.emitter import check_emitter
 from mrt_mitsuba.validation.checks.examine import Check
-from mrt_mitsuba.validation.checks.law import Description, Fault, faults_of
+from mrt_mitsuba.validation.checks.law import Description, Fault, Judge, faults_of
 from mrt_mitsuba.validation.checks.shape import check_shape
 from mrt_mitsuba.validation.checks.subject import Given
 
@@ -172,11 +172,15 @@ def _faulty_sky(fault, changes):
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of plugins: how to check them, the faults that its laws find, and a plugin with one of them."""
+    """A kind of plugins: how to check them, their laws by name, and a plugin with a fault."""
 
     check: Callable[..., Check]
-    faults: Sequence[Fault]
+    laws: Mapping[str, Judge]
     faulty: Callable[..., Given]
+
+    @property
+    def faults(self) -> list[Fault]:
+        return faults_of(self.laws.values())
 
     def check_fault(self, fault: Fault, size: float, *, quick: bool) -> Check:
         """Check a plugin with a fault of that size by the law that should find it."""
@@ -197,9 +201,9 @@ class Kind:
 FACTORS = (3, 2, 1, 0.5, 0.3, 0.1)
 FAULTY: dict[str, Changes] = {}  # by name, the changes of the BSDF "faulty"
 KINDS = {
-    "BSDF": Kind(check_bsdf, faults_of(bsdf.LAWS.values()), _faulty_bsdf),
-    "shape": Kind(check_shape, faults_of(shape.LAWS.values()), _faulty_shape),
-    "emitter": Kind(check_emitter, faults_of(emitter.LAWS.values()), _faulty_sky),
+    "BSDF": Kind(check_bsdf, bsdf.LAWS, _faulty_bsdf),
+    "shape": Kind(check_shape, shape.LAWS, _faulty_shape),
+    "emitter": Kind(check_emitter, emitter.LAWS, _faulty_sky),
 }
 
 
@@ -210,22 +214,45 @@ def register(*variants: str) -> None:
         mi.register_bsdf("faulty", changed_bsdf(FAULTY))
 
 
-def table(least: Callable[..., float]) -> Iterator[str]:
-    """The lines of a table of all faults, in Markdown; ``least(kind, fault, quick=…)`` is the size found."""
-    yield "| law | of a | fault | quick | full |\n|---|---|---|---|---|"
+class Markdown(str):
+    """A text that notebooks show as such."""
+
+    def _repr_markdown_(self) -> str:
+        return self
+
+
+def statements() -> Markdown:
+    """A table of all laws, by the first lines of their docstrings."""
+    lines = ["| of a | law | says |", "|---|---|---|"]
     for name, kind in KINDS.items():
-        for fault in kind.faults:
-            sizes = [least(kind, fault, quick=quick) for quick in (True, False)]
-            quick, full = ("not found" if np.isinf(size) else f"{size:.1g}" for size in sizes)
-            yield f"| `{fault.law}` | {name} | {fault.what} | {quick} | {full} |"
+        for law in kind.laws.values():
+            words = str(law.__doc__).splitlines()[0].replace("``", "`").replace("|", "\\|")
+            lines.append(f"| {name} | `{law.__name__}` | {words} |")
+    return Markdown("\n".join(lines))
 
 
-def stated(kind: Kind, fault: Fault, *, quick: bool) -> float:
-    """The least size that the law is said to find."""
-    return fault.quick if quick else fault.full
+def stated() -> Markdown:
+    """A table of all faults, and the least size that their laws are said to find."""
+    rows = [
+        row(name, fault, fault.quick, fault.full) for name, kind in KINDS.items() for fault in kind.faults
+    ]
+    return Markdown("\n".join([HEAD, *rows]))
+
+
+HEAD = "| of a | law | finds | quick | full |\n|---|---|---|---|---|"
+
+
+def row(name: str, fault: Fault, *least: float) -> str:
+    sizes = ["not found" if np.isinf(size) else f"{size:.1g}" for size in least]
+    return f"| {name} | `{fault.law}` | {fault.what} | {' | '.join(sizes)} |"
 
 
 if __name__ == "__main__":  # measures them
     register(runtime.SLOW, runtime.FAST)
-    for line in table(Kind.least_found):
-        print(line, flush=True)
+    print(HEAD)
+    for name, kind in KINDS.items():
+        for fault in kind.faults:
+            print(
+                row(name, fault, *(kind.least_found(fault, quick=quick) for quick in (True, False))),
+                flush=True,
+            )
