@@ -87,9 +87,7 @@ class Case(Subject):
             raise UsageError(f"{kind} is not an emitter of {mi.variant()}: give a dict or a loaded emitter")
         alone = scene is None
         self.lit = scene or self._lit_sphere()  # an emitter keeps neither its scene nor its shape alive
-        box = self.lit.bbox()
-        low = np.nan_to_num(np.ravel(np.array(box.min)), posinf=1, neginf=-1)
-        high = np.nan_to_num(np.ravel(np.array(box.max)), posinf=1, neginf=-1)
+        low, high = np.nan_to_num(probe.corners(self.lit), posinf=1, neginf=-1)
         outer = 0.1 * (high - low)
         points = self.rng.uniform(low - outer, high + outer, (2**12, 3))
         self.points = np.float32(points)
@@ -147,12 +145,11 @@ class Case(Subject):
             again = self.plugin.pdf_direction(it, ds)
             return [ds.p, ds.d, ds.dist, ds.pdf, again, ds.delta, weight, value]
 
-        names = ("p", "d", "dist", "pdf", "again", "delta", "weight", "value")
         try:
             columns = lanes(call, ("Point3f", points), ("Point2f", self.uniform(len(points), 2)))
         except (NotImplementedError, RuntimeError) as error:
             raise Skip("directions cannot be sampled") from error
-        s = Lanes(**dict(zip(names, columns, strict=True)))
+        s = probe.named("p d dist pdf again delta weight value", columns)
         s.lit = (s.weight != 0).any(axis=1)
         return s
 
@@ -160,13 +157,17 @@ class Case(Subject):
         """The density of directions [N] and the light that is seen there [N, channels]."""
 
         def call(d: mi.Vector3f) -> list[mi.Float]:
-            it = _seen_from(mi.Point3f(*map(float, self.points[0])))
+            it = self.from_first()
             ds, _ = self.plugin.sample_direction(it, mi.Point2f(0.5))
             ds.d = d
             it.wi = -d
             return [self.plugin.pdf_direction(it, ds), self.plugin.eval(it)]
 
         return lanes(call, ("Vector3f", d))
+
+    def from_first(self) -> mi.SurfaceInteraction3f:
+        """The first of the points."""
+        return _seen_from(mi.Point3f(*map(float, self.points[0])))
 
     def density(self, d: Array) -> Array:
         """The density of directions. [N]"""
@@ -298,10 +299,9 @@ def _in_small_cells(law: Law, case: Case) -> None:
 
 def _directions(case: Case, u: Array) -> Array:
     """Sampled directions from one point, by random numbers [N, 2], without those refused in the light."""
-    o = mi.Point3f(*map(float, case.points[0]))
 
     def call(u: mi.Point2f) -> list[mi.Float]:
-        it = _seen_from(o)
+        it = case.from_first()
         ds, weight = case.plugin.sample_direction(it, u)
         return [ds.d, weight, case.plugin.eval_direction(it, ds)]
 
@@ -350,7 +350,7 @@ def finite(law: Law, case: Case) -> None:
 
 def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
     """Samples from one point, and which of them are not finite, or negative."""
-    it = _seen_from(mi.Point3f(*map(float, case.points[0])))
+    it = case.from_first()
     ds, weight = case.plugin.sample_direction(it, mi.Point2f(draw(), draw()))
     weight = mi.unpolarized_spectrum(weight)
     lit = dr.any(weight != 0)

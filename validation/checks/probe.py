@@ -34,6 +34,17 @@ def joined(parts: Sequence[Part]) -> Part:
     return type(first)(**columns)
 
 
+def named(names: str, columns: Sequence[Array]) -> Lanes:
+    """Columns under names, which spaces part."""
+    return Lanes(**dict(zip(names.split(), columns, strict=True)))
+
+
+def corners(plugin: mi.Object) -> Array:
+    """The least and the greatest corner of a bounding box. [2, 3]"""
+    box = plugin.bbox()
+    return np.array([np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max)])
+
+
 def is_scalar() -> bool:
     """Whether the current variant takes one direction at a time."""
     return mi.variant().startswith("scalar")
@@ -144,8 +155,7 @@ class Probe:
             bs, weight = self.plugin.sample(c, si, u.x, mi.Point2f(u.y, u.z))
             return [bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, weight]
 
-        names = ("wo", "pdf", "eta", "type", "component", "weight")
-        s = Lanes(**dict(zip(names, self.ask(call, wi, u, uv, ctx), strict=True)))
+        s = named("wo pdf eta type component weight", self.ask(call, wi, u, uv, ctx))
         s.type = s.type.astype(np.int64)
         s.component = s.component.astype(np.int64)
         s.delta = (s.type & int(mi.BSDFFlags.Delta)) != 0

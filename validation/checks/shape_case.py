@@ -16,7 +16,9 @@ from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import (
     Array,
     Lanes,
+    corners,
     lanes,
+    named,
     unit,
 )
 from mrt_mitsuba.validation.checks.subject import Given, Subject
@@ -49,9 +51,9 @@ def trace(target: mi.Scene, o: Array, d: Array) -> Lanes:
         si = target.ray_intersect(mi.Ray3f(origin, direction))
         return [si.is_valid(), si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv, si.prim_index]
 
-    names = ("met", "t", "p", "n", "shading", "du", "dv", "uv", "part")
-    columns = lanes(call, ("Point3f", o), ("Vector3f", d))
-    hits = Lanes(o=o, d=d, **dict(zip(names, columns, strict=True)))
+    hits = named("met t p n shading du dv uv part", lanes(call, ("Point3f", o), ("Vector3f", d)))
+    hits.o = o
+    hits.d = d
     hits.cos = dot(hits.n, d)
     hits.steep = hits.met & (abs(hits.cos) > FLAT)
     return hits
@@ -199,9 +201,3 @@ def leave(hits: Lanes, d: Array) -> Array:
     """Origins [N, 3] off points ``p`` with normals ``n``, on the side of ``d``, as ``spawn_ray`` has them."""
     outwards = np.sign(dot(hits.n, d))[:, None] * hits.n
     return np.float32(hits.p + outwards * offset(hits.p)[:, None])
-
-
-def corners(plugin: mi.Shape) -> Array:
-    """The least and the greatest corner of a bounding box. [2, 3]"""
-    box = plugin.bbox()
-    return np.array([np.ravel(np.array(corner, np.float64)) for corner in (box.min, box.max)])

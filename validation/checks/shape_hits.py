@@ -30,6 +30,7 @@ from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import (
     Array,
     Lanes,
+    corners,
     lanes,
     not_finite,
     unit,
@@ -42,7 +43,6 @@ from mrt_mitsuba.validation.checks.shape_case import (
     SMOOTHED,
     TYPICAL,
     Case,
-    corners,
     dot,
     leave,
     near,
@@ -195,23 +195,13 @@ def _noise(law: Law, case: Case) -> None:
     scale = abs(met.o).max(axis=1) + met.t
     inputs = np.concatenate([met.o, met.d], axis=1)
 
-    def hits(x: Array) -> Lanes:
-        return trace(case.target, x[:, :3], x[:, 3:])
+    def number(which: int, x: Array) -> Array:
+        hits = trace(case.target, x[:, :3], x[:, 3:])
+        return (hits.t, hits.p.sum(axis=1), hits.n @ (0.6, 0.48, 0.64))[which]
 
-    def distance(x: Array) -> Array:
-        return hits(x).t
-
-    def point(x: Array) -> Array:
-        return hits(x).p.sum(axis=1)
-
-    def normal(x: Array) -> Array:
-        return hits(x).n @ [0.6, 0.48, 0.64]
-
-    for what, size, quantity in (
-        ("distance", scale, distance),
-        ("hit point", scale, point),
-        ("normal", 1 + 0 * scale, normal),
-    ):
+    sizes = {"distance": scale, "hit point": scale, "normal": np.ones_like(scale)}
+    for which, (what, size) in enumerate(sizes.items()):
+        quantity = partial(number, which)
         estimate = noise.measure(quantity, inputs, size=size, strides=(64,), seed=case.seed)
         law.hold("noise", estimate.lost, met, what=what)
 
