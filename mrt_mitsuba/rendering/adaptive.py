@@ -112,7 +112,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
             film.put_block(
                 mi.ImageBlock(tensor=values, offset=film.crop_offset(), rfilter=film.rfilter(), border=False)
             )
-            return self._seen(film.develop()) if develop else mi.TensorXf()
+            return self._seen(film.develop(), names) if develop else mi.TensorXf()
 
     def sample(self, *_: Any) -> Any:
         raise ParameterError(
@@ -130,13 +130,25 @@ class MrtAdaptive(mi.SamplingIntegrator):
         """Number of channels that a film takes up next to those of the nested integrator."""
         return 0 if _has_bands_only(film) else len(self._own_names())
 
-    def _seen(self, picture: mi.TensorXf) -> mi.TensorXf:
-        """Return the channels that ``mi.render`` shows of the nested integrator, and those of this one."""
-        if self.nested.class_name() != "AOVIntegrator" or "A" not in (n[-1] for n in self.aov_names()[3:4]):
+    def _seen(self, picture: mi.TensorXf, names: list[str]) -> mi.TensorXf:
+        """What ``mi.render`` shows of a picture whose last channels have these ``names``.
+
+        Of an ``aov``, it shows each integrator inside like a film; the first as the colours.
+        """
+        if self.nested.class_name() != "AOVIntegrator" or not names:
             return picture
-        # the picture of its first integrator is the colours once more, and Mitsuba leaves it out
-        first = picture.shape[2] - len(self.aov_names())
-        return mi.TensorXf(np.delete(np.array(picture), np.s_[first : first + 4], axis=2))
+        from mrt_mitsuba.rendering.noise import LUMINANCE
+
+        film, further = np.split(np.array(picture), [picture.shape[2] - len(names)], axis=2)
+        shown = []
+        while [name[-1] for name in names[:4]] == ["R", "G", "B", "A"]:
+            colors, alpha, further = np.split(further, [3, 4], axis=2)
+            grey = (colors @ LUMINANCE)[..., None]
+            transparent = film.shape[2] in (2, 4)
+            inside = [grey if film.shape[2] < 3 else colors, *[alpha] * transparent]
+            shown += inside if shown else [film]
+            names = names[4:]
+        return mi.TensorXf(np.concatenate([*shown, further], axis=2, dtype=np.float32))
 
     def render_forward(
         self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: int = 0, spp: int = 0

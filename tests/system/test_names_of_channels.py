@@ -113,6 +113,24 @@ def test_mrt_adaptive_around_aov(variant, name):
     assert picture[..., 3:6].max() == pytest.approx(1, abs=0.2)  # of a ball of radius one
 
 
+@pytest.mark.parametrize(
+    "inner", [{}, {"x": {"type": "path"}}, {"x": {"type": "direct"}, "y": {"type": "path"}}]
+)
+@pytest.mark.parametrize("pixel_format", ["rgb", "rgba", "luminance"])
+def test_mrt_adaptive_shows_of_aov_what_mitsuba_shows(inner, pixel_format):
+    """Without an integrator, ``aov`` has no colours: black ones stood before its channels."""
+    aov = {"type": "aov", "aovs": "p:position", **inner}
+    loaded = scene({"type": "mrt_adaptive", "spp": 16, "nested": aov})
+    eye = sensor([0, 1, 6], [0, 0, 0], (8, 6), fov=25)
+    eye["film"]["pixel_format"] = pixel_format
+    view = mi.load_dict(eye)
+    expected = np.array(mi.render(loaded, sensor=view, integrator=mi.load_dict(aov), spp=64))
+    picture = np.array(mi.render(loaded, sensor=view))
+    assert picture.shape == (6, 8, expected.shape[2] + 2)
+    # 16 rays of a pixel for 64, over 48 pixels of which some lie on the outline
+    assert_allclose(picture[..., :-2].mean((0, 1)), expected.mean((0, 1)), atol=0.1)
+
+
 @pytest.mark.parametrize("door", ["mi.render", "mrt.render", "prepare", "target"])
 def test_integrators_without_to_string(door):
     loaded = scene(of_the_user("a"))
