@@ -140,7 +140,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         from mrt_mitsuba.rendering.noise import LUMINANCE
 
         film, further = np.split(np.array(picture), [picture.shape[2] - len(names)], axis=2)
-        shown = []
+        shown = list[np.ndarray]()
         while [name[-1] for name in names[:4]] == ["R", "G", "B", "A"]:
             colors, alpha, further = np.split(further, [3, 4], axis=2)
             grey = (colors @ LUMINANCE)[..., None]

@@ -319,10 +319,9 @@ class Exposer:
         sampling = Independent(seed, opaque(places.size)) if random else None
         return LatticeStarts(places, shader.width, shader.height, sampling)
 
-    def average(self, pixels: Any, starts: LatticeStarts, means: Means, advance: Advance) -> None:
+    def average(self, groups: Groups, starts: Starts, means: Means, advance: Advance) -> None:
         """Trace the rays of a lattice in pixels, and take up their means. They do not depend on how memory
         cuts the rays into wavefronts."""
-        groups = Groups(starts.places.size, pixels)
         channels = len(self.names)
         for part, _, _, values in self._wavefronts(groups, starts, channels):
             means.put(part, values)

@@ -91,7 +91,7 @@ class Passes:
             layers[name] = layer.reshape(len(self._pixels), -1)
         means = Means(layers, places.size, edge, (places.first, places.count))
         with self._job.stage(step.name, len(pixels)) as advance:
-            exposer.average(pixels, exposer.starts(places, seed), means, advance)
+            exposer.average(Groups(places.size, pixels), exposer.starts(places, seed), means, advance)
         if "square" in step.layers:
             variance = np.maximum(self.layers["square"] - self.layers["image"] ** 2, 0)
             self.layers["square"] = variance / (places.size - 1)  # of the means
