@@ -47,37 +47,47 @@ class Canvas:
             self.peak = self._moments[6].reshape(shape)
 
     def put(
-        self, place: mi.Point2f | np.ndarray, values: Sequence[mi.Float], pixels: np.ndarray, size: int
+        self, place: mi.Point2f | np.ndarray | None, values: Sequence[mi.Float], rays: np.ndarray
     ) -> None:
         """Add the values of rays, [channels] each, colours first, at their places on the film.
 
-        ``pixels``: where ``size`` rays each start, ascending; those of the second picture follow on those of
-        the first.
+        ``rays``: how many start in each pixel, those of the second picture after those of the first; they
+        come in this order. ``place``: None where the filter is a box.
         """
         if isinstance(place, np.ndarray):
-            self._put_one_by_one(place, np.asarray(values), np.repeat(pixels.astype(np.int64), size))
+            self._put_one_by_one(place, np.asarray(values), np.repeat(np.arange(rays.size), rays))
             return
-        counts = size * np.bincount(pixels + 1, minlength=self.rays.size + 1)
-        first = mi.UInt32(np.cumsum(counts, dtype=np.uint32))
-        rays = _Rays(place, values, first, mi.Float(self._share), self._film)
-        width = self._film.width
-        end = (int(pixels[-1]) // width + 1) * width
-        step = max(PIXELS_AT_ONCE // width, 1) * width
-        for low in range(int(pixels[0]) // width * width, end, step):
-            self._put_rows(rays, low, min(low + step, end))
+        film = self._film
+        if not film.reach:
+            self._sums[-1] += self._share * rays.astype(np.float32)
+        first = np.zeros(rays.size + 1, np.uint32)
+        np.cumsum(rays, dtype=np.uint32, out=first[1:])
+        some = _Rays(place, values, mi.UInt32(first), mi.Float(self._share), film)
+        chosen = np.flatnonzero(rays.reshape(-1, film.width).any(1))  # rows
+        step = max(PIXELS_AT_ONCE // film.width, 1)
+        for row in range(chosen[0], chosen[-1] + 1, step):
+            end = min(row + step, chosen[-1] + 1)
+            self._put_rows(some, row * film.width, end * film.width)
 
     def _put_rows(self, rays: _Rays, low: int, high: int) -> None:
         """Add what rays give that start in pixels from ``low`` to below ``high``, which are whole rows."""
-        film, channels = self._film, len(self._sums)
+        film = self._film
+        first, channels = 0, len(self._sums)
         if len(self._moments):
-            *sums, peak = rays.moments(low, high)
-            dr.eval(sums, peak)
-            for known, more in zip(self._moments, sums, strict=False):
-                known[low:high] += np.asarray(more)
+            *terms, peak = rays.moments(low, high)
+            dr.eval(terms, peak)
+            moments = [np.asarray(term) for term in terms]
+            for known, more in zip(self._moments, moments, strict=False):
+                known[low:high] += more
             brightest = self._moments[6, low:high]
             np.maximum(brightest, np.asarray(peak), out=brightest)
+        if not film.reach:  # whose weights are 1
+            channels -= 1
+            if len(self._moments):
+                first = 3
+                self._sums[:3, low:high] += self._share[low:high] * np.stack(moments[:3])
         offsets = _parts(-film.reach, film.reach + 1, OFFSETS_AT_ONCE)
-        for some in _parts(0, channels, CHANNELS_AT_ONCE):
+        for some in _parts(first, channels, CHANNELS_AT_ONCE):
             for down, across in product(offsets, offsets):
                 sums = rays.filtered(low, high, some, down, across)
                 begin, end = low, high
@@ -119,7 +129,7 @@ class Canvas:
 class _Rays:
     """The rays of a wavefront, sorted by the pixel in which they start."""
 
-    place: mi.Point2f  #: on the film, in pixels
+    place: mi.Point2f | None  #: on the film, in pixels; None under a box filter
     values: Sequence[mi.Float]  #: by channel, colours first
     first: mi.UInt32  #: number of the first ray of each pixel, and that of all rays
     share: mi.Float  #: of a ray among all in its pixel, by pixel

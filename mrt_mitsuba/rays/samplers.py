@@ -1,4 +1,10 @@
-"""The random numbers of rays: samplers for Mitsuba, executed and registered once for each variant."""
+"""The random numbers of rays: samplers for Mitsuba, executed and registered once for each variant.
+
+Each says what adaptive sampling has to know of it: ``group``, the rays of a pixel that it traces together;
+``fields``, into how many sets pixels can be divided such that the rays of one say nothing about those of
+another; ``gain``, by what power of the rays variance may fall beyond the first; and ``spacing``, between the
+numbers of rays that suit it. ``ADAPTIVE`` names the one that adaptive sampling uses.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +12,12 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mrt_mitsuba.rays.film import opaque
+
+# Of adaptive sampling; in scalar variants, where rays are traced one by one, and elsewhere
+ADAPTIVE = "mrt_rays" if mi.variant().startswith("scalar") else "mrt_sequence"
 # The golden ratio in 32 bits: numbers that follow each other, times this, lie far apart
 STRIDE = 0x9E3779B9
 # Sobol's second coordinate: bit i of the index takes part where Pascal's triangle is odd, in five doublings
@@ -17,12 +28,25 @@ class RaySampler(mi.Sampler):
     """Draws the numbers of Mitsuba's ``independent``, with rays that need not begin with number 0.
 
     ``independent`` numbers the rays of every wavefront from 0, so that pictures would depend on how they
-    are cut into wavefronts.
+    are cut into wavefronts. ``rays``: of each pixel, as ``start_in`` numbers them.
     """
+
+    group = 2
+    fields = 2
+    gain = 0.0
 
     def __init__(self, props: Any) -> None:
         mi.Sampler.__init__(self, props)
+        self.rays = props.get("rays", 2**24)
         self.random = mi.PCG32()
+
+    @staticmethod
+    def spacing(rays: np.ndarray) -> np.ndarray:
+        return np.full_like(rays, RaySampler.group)
+
+    def start_in(self, seed: Any, pixel: Any, number: Any) -> None:
+        """Turn to rays of pixels, given their numbers among all of the pixel."""
+        self.start(seed, mi.UInt64(pixel) * mi.UInt64(opaque(self.rays)) + mi.UInt64(number))
 
     def start(self, seed: Any, number: Any) -> None:
         """Turn to the rays of these numbers, or of this one in scalar variants.
@@ -55,9 +79,23 @@ class PixelSequence(mi.Sampler):
     B. Burley, "Practical hash-based Owen scrambling" (2020). ``dimension`` counts what a ray has drawn.
     """
 
+    group = 2
+    fields = 2
+    gain = 0.5
+
     def __init__(self, props: Any) -> None:
         mi.Sampler.__init__(self, props)
         self.index, self.key, self.dimension = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+
+    @staticmethod
+    def spacing(rays: np.ndarray) -> np.ndarray:
+        """An eighth to a quarter of the rays, a power of two: small multiples of large ones err least (A. B.
+        Owen, 1995)."""
+        return np.ldexp(np.float32(0.125), np.maximum(np.frexp(rays)[1], 4))
+
+    def start_in(self, seed: Any, pixel: Any, number: Any) -> None:
+        """Turn to rays of pixels, given their numbers among all of the pixel."""
+        self.start(number, mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, seed))[0])
 
     def start(self, index: Any, key: Any) -> None:
         """Turn to the rays with these numbers in their pixels, the pixels having these keys."""

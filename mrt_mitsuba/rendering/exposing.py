@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
@@ -35,51 +35,84 @@ OWN = "own:"  # begins what is no layer's name: the channels of the film and the
 
 
 class Groups(NamedTuple):
-    """Groups of ``size`` rays, each in one pixel; several may be in the same."""
+    """Groups of ``size`` rays, each in one entry of a list of pixels."""
 
     size: int
-    pixels: Any  #: of each: numbers row by row, those of a second picture after those of the first; ascending
-    first: np.ndarray | None = None  #: of each, the number of its first ray among all of its pixel; None: 0
-    before: int = 0  #: number of groups in earlier wavefronts
+    pixels: Any  #: of each entry: numbers row by row, those of a second picture after those of the first
+    counts: np.ndarray | None = None  #: groups of each entry; None: one
+    first: np.ndarray | None = None  #: number of an entry's first ray among all of its pixel; None: 0
+    before: int = 0  #: groups in earlier wavefronts
 
     @classmethod
-    def spread(cls, size: int, counts: np.ndarray, before: np.ndarray) -> Groups:
-        """Return ``counts`` groups in each picture and pixel, [pictures, pixels], after ``before`` rays."""
-        counts = counts.ravel()
-        pixels = np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
-        first = (before.ravel() - size * (np.cumsum(counts) - counts)).astype(np.int64).astype(np.uint32)
-        return cls(size, pixels, np.repeat(first, counts) + size * np.arange(len(pixels), dtype=np.uint32))
+    def shared_out(cls, size: int, counts: np.ndarray, before: np.ndarray) -> Groups:
+        """``counts`` groups in each picture and pixel, [pictures, pixels], after ``before`` rays there."""
+        chosen = np.flatnonzero(counts)
+        return cls(size, chosen, counts.ravel()[chosen], before.ravel()[chosen].astype(np.int64))
 
-    def parts(self, most: int, width: int) -> Iterator[tuple[slice, Groups]]:
-        """Yield parts of no more than ``most`` groups, cut between rows where that can be, and which groups
-        are in each."""
-        start = 0
-        count = len(self.pixels)
-        while start < count:
-            stop = min(start + most, count)
-            if stop < count:
-                row = bisect_left(self.pixels, self.pixels[stop] // width * width)
-                stop = row if row > start else stop
-            part = slice(start, stop)
-            first = None if self.first is None else self.first[part]
-            yield part, Groups(self.size, self.pixels[part], first, start)
-            start = stop
+    @property
+    def count(self) -> int:
+        """Number of groups."""
+        return len(self.pixels) if self.counts is None else int(self.counts.sum())
 
     @property
     def rays(self) -> int:
         """Number of rays."""
-        return len(self.pixels) * self.size
+        return self.count * self.size
+
+    def rays_of(self, pixels: int) -> np.ndarray:
+        """The rays in each of so many pixels, [pixels]."""
+        rays = np.zeros(pixels, np.int64)
+        given = self.pixels
+        at = slice(given.start, given.stop) if isinstance(given, range) else given
+        rays[at] = self.size if self.counts is None else self.size * self.counts
+        return rays
+
+    def parts(self, most: int, width: int) -> Iterator[tuple[slice, Groups]]:
+        """Cut into parts of no more than ``most`` groups, between rows where that can be.
+
+        Yields the entries in each part, and their groups.
+        """
+        every = self._with_entries_of(most)
+        count = len(every.pixels)
+        ends = None if every.counts is None else np.cumsum(every.counts)
+        start = 0
+        before = 0
+        while start < count:
+            stop = start + most if ends is None else int(np.searchsorted(ends, before + most, "right"))
+            if stop < count:
+                row = bisect_left(every.pixels, every.pixels[stop] // width * width)
+                stop = row if row > start else stop
+            part = slice(start, min(stop, count))
+            counts = None if every.counts is None else every.counts[part]
+            first = None if every.first is None else every.first[part]
+            some = Groups(self.size, every.pixels[part], counts, first, before)
+            yield part, some
+            before += some.count
+            start = stop
+
+    def _with_entries_of(self, most: int) -> Groups:
+        """The same groups, with several entries for a pixel of more than ``most``."""
+        if self.counts is None or self.first is None or self.counts.max(initial=0) <= most:
+            return self
+        pieces = -(-self.counts // most)
+        number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        counts = np.minimum(np.repeat(self.counts, pieces) - most * number, most)
+        first = np.repeat(self.first, pieces) + self.size * most * number
+        return Groups(self.size, np.repeat(self.pixels, pieces), counts, first)
 
     def lanes(self) -> tuple[mi.UInt32, mi.UInt32]:
-        """Return of each ray the number of its pixel, and its own among all of the pixel."""
-        group, number = divide(dr.arange(mi.UInt32, self.rays), self.size)
+        """The pixel of each ray, and its number among all rays of the pixel."""
+        ray = dr.arange(mi.UInt32, self.rays)
+        entry, number = divide(ray, self.size)
+        if self.counts is not None and self.first is not None:
+            starts = np.cumsum(self.counts) - self.counts  # the first group of each entry
+            begins = dr.zeros(mi.UInt32, self.count)
+            dr.scatter(begins, mi.UInt32(1), mi.UInt32(starts))
+            entry = dr.gather(mi.UInt32, dr.cumsum(begins), entry) - 1
+            number = ray + dr.gather(mi.UInt32, mi.UInt32(self.first - self.size * starts), entry)
         if isinstance(self.pixels, range):
-            pixel = group + opaque(self.pixels.start)
-        else:
-            pixel = dr.gather(mi.UInt32, mi.UInt32(self.pixels), group)
-        if self.first is not None:
-            number += dr.gather(mi.UInt32, mi.UInt32(self.first), group)
-        return pixel, number
+            return entry + opaque(self.pixels.start), number
+        return dr.gather(mi.UInt32, mi.UInt32(self.pixels), entry), number
 
 
 # ------------------------------------------ Where rays start ------------------------------------------
@@ -103,43 +136,9 @@ class Starts(Protocol):
         ...
 
 
-class Sampling(Protocol):
-    """Random numbers of rays."""
-
-    seed: Any
-
-    def start(self, pixel: mi.UInt32, number: mi.UInt32) -> mi.Sampler:
-        """Return a sampler of rays, given their pixels and their numbers among all of the pixel."""
-        ...
-
-
-class Independent:
-    """Independent random numbers, as Mitsuba numbers the rays of a whole picture, ``rays`` in each pixel.
-
-    ``seed``: a number, or an array of one.
-    """
-
-    def __init__(self, seed: Any, rays: Any) -> None:
-        self.seed = seed
-        self._rays = rays
-        self._sampler = mi.load_dict({"type": "mrt_rays"})
-
-    def start(self, pixel: mi.UInt32, number: mi.UInt32) -> mi.Sampler:
-        self._sampler.start(self.seed, mi.UInt64(pixel) * mi.UInt64(self._rays) + mi.UInt64(number))
-        return self._sampler
-
-
-class Sequences:
-    """One sequence for each pixel, to be continued by later exposures."""
-
-    def __init__(self, seed: int) -> None:
-        self.seed = seed
-        self._sampler = mi.load_dict({"type": "mrt_sequence"})
-
-    def start(self, pixel: mi.UInt32, number: mi.UInt32) -> mi.Sampler:
-        key = mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, self.seed))[0]
-        self._sampler.start(number, key)
-        return self._sampler
+def ray_sampler(rays: int) -> mi.Sampler:
+    """Independent random numbers, as Mitsuba numbers the rays of a whole picture, ``rays`` in each pixel."""
+    return mi.load_dict({"type": "mrt_rays", "rays": rays})
 
 
 @dataclass(frozen=True)
@@ -149,11 +148,13 @@ class LatticeStarts:
     places: Places
     width: int
     height: int
-    sampling: Sampling | None  #: of what else is random; None where nothing is
+    seed: Any  #: a number, or an array of one
+    sampler: mi.Sampler | None  #: of what else is random; None where nothing is
 
     def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
-        sampler = None if self.sampling is None else self.sampling.start(pixel, number)
-        return Start(None, *self.places.at(pixel, number, self.width, self.height), sampler)
+        if self.sampler is not None:
+            self.sampler.start_in(self.seed, pixel, number)
+        return Start(None, *self.places.at(pixel, number, self.width, self.height), self.sampler)
 
 
 @dataclass(frozen=True)
@@ -161,11 +162,13 @@ class FilmStarts:
     """Rays start in the pixels of a film where random numbers place them."""
 
     film: Film
-    sampling: Sampling
+    seed: Any  #: a number, or an array of one
+    sampler: mi.Sampler  #: one of ``rays/samplers.py``
 
     def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
-        sampler = self.sampling.start(pixel, number)
-        return Start(*self.film.place(divide(pixel, self.film.pixels)[1], sampler), None, sampler)
+        self.sampler.start_in(self.seed, pixel, number)
+        inside = divide(pixel, self.film.pixels)[1]
+        return Start(*self.film.place(inside, self.sampler), None, self.sampler)
 
 
 class SceneStarts:
@@ -177,11 +180,12 @@ class SceneStarts:
         self._rays = rays
         one_by_one = mi.variant().startswith("scalar")
         independent = one_by_one or film.sampler == "IndependentSampler"
-        self._independent = Independent(seed, opaque(rays)) if independent else None
+        self._independent = ray_sampler(rays) if independent else None
 
     def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
-        if self._independent:
-            sampler = self._independent.start(pixel, number)
+        if self._independent is not None:
+            sampler = self._independent
+            sampler.start_in(self._seed, pixel, number)
         else:
             sampler = self._film.sensor.sampler().clone()
             sampler.set_sample_count(self._rays)
@@ -238,42 +242,38 @@ class Means:
         return np.asarray(dr.block_reduce(dr.ReduceOp.Add, plane, size))
 
 
+@dataclass(frozen=True)
 class Stack:
     """Pictures in the making, exposure upon exposure.
 
     An exposure may leave pixels out. It counts in proportion to the independent rays that it brings to a
     pixel, and only where none is missing under the filter; the rays of a pixel have the same weight in all.
-
-    ``sums`` [channels, pictures, H, W]: filtered values times their weights; ``weights`` and ``amount``
-    [pictures, H, W]: sums of these weights, and of those of the exposures; ``rays`` [pictures, pixels].
     """
 
-    def __init__(self, film: Film, pictures: int, channels: int) -> None:
-        self.film = film
-        self.rays = np.zeros((pictures, film.pixels))
-        self.sums = np.zeros((channels, pictures, *film.shape), np.float32)
-        self.weights = np.zeros((pictures, *film.shape), np.float32)
-        self.amount = np.zeros((pictures, *film.shape), np.float32)
+    film: Film
+    sums: np.ndarray  #: filtered values times their weights, [channels, pictures, H, W]
+    weights: np.ndarray  #: sums of these weights, [pictures, H, W]
+    amount: np.ndarray  #: sums of the weights of exposures, [pictures, H, W]
 
-    def widened(self, groups: np.ndarray) -> np.ndarray:
-        """Return numbers of groups [pictures, pixels], one at least wherever the filter reaches from."""
-        if not self.film.reach:
-            return groups
-        near = dilated(self.rows(groups) > 0, self.film.reach)
-        return np.maximum(groups, near.reshape(groups.shape))
+    @classmethod
+    def blank(cls, film: Film, pictures: int, channels: int) -> Stack:
+        """Pictures that nothing was exposed to."""
+        sums = np.zeros((channels, pictures, *film.shape), np.float32)
+        return cls(film, sums, np.zeros_like(sums[0]), np.zeros_like(sums[0]))
 
     @np.errstate(over="ignore")  # of light beyond float32, whose mean is infinite
-    def add(self, exposed: Canvas, chosen: np.ndarray, first: int = 0) -> None:
-        """Add as many pictures of an exposure as there are ``chosen`` pixels for, [pictures, pixels], from
+    def plus(self, exposed: Canvas, chosen: np.ndarray, first: int = 0) -> Stack:
+        """With as many pictures of an exposure as there are ``chosen`` pixels for, [pictures, pixels], from
         the ``first`` on."""
         some = slice(first, first + len(chosen))
-        rays = exposed.rays[some]
-        each = np.float32(1 / np.maximum(rays, 1))  # variance of a pixel's mean, up to a factor
+        each = np.float32(1 / np.maximum(exposed.rays[some], 1))  # variance of a pixel's mean, up to a factor
         amount = self.rows(chosen) / self.film.spread_out(self.rows(each))
-        self.sums += amount * exposed.sums[: len(self.sums), some]
-        self.weights += amount * exposed.weights[some]
-        self.amount += amount
-        self.rays += rays
+        return replace(
+            self,
+            sums=self.sums + amount * exposed.sums[: len(self.sums), some],
+            weights=self.weights + amount * exposed.weights[some],
+            amount=self.amount + amount,
+        )
 
     def pictures(self) -> np.ndarray:
         """Return the pictures one by one, [pictures, H, W, channels], with the film's border."""
@@ -291,6 +291,14 @@ class Stack:
     def rows(self, values: np.ndarray) -> np.ndarray:
         """Return a view [pictures, H, W, ...] of values [pictures, pixels, ...]."""
         return values.reshape(-1, *self.film.shape, *values.shape[2:])
+
+
+def widened(film: Film, counts: np.ndarray) -> np.ndarray:
+    """Counts [pictures, pixels], at least one wherever the film's filter reaches from."""
+    if not film.reach:
+        return counts
+    near = dilated(counts.reshape(-1, *film.shape) > 0, film.reach)
+    return np.maximum(counts, near.reshape(counts.shape))
 
 
 class Exposer:
@@ -316,8 +324,8 @@ class Exposer:
         if self.film is not None:
             return SceneStarts(self.film, seed, self.film.rays_near(places.size))
         random = shader.random or mi.is_spectral or shader.sensor.needs_aperture_sample()
-        sampling = Independent(seed, opaque(places.size)) if random else None
-        return LatticeStarts(places, shader.width, shader.height, sampling)
+        sampler = ray_sampler(places.size) if random else None
+        return LatticeStarts(places, shader.width, shader.height, seed, sampler)
 
     def average(self, groups: Groups, starts: Starts, means: Means, advance: Advance) -> None:
         """Trace the rays of a lattice in pixels, and take up their means. They do not depend on how memory
@@ -342,11 +350,11 @@ class Exposer:
         """Trace groups of rays on a film, and add their values up; with ``moments``, the squares of their
         colours as well."""
         film = self.film
-        rays = np.bincount(groups.pixels, minlength=pictures * film.pixels).reshape(pictures, -1)
-        canvas = Canvas(film, rays * groups.size, len(self.names), moments=moments)
+        rays = groups.rays_of(pictures * film.pixels).reshape(pictures, -1)
+        canvas = Canvas(film, rays, len(self.names), moments=moments)
         for _, some, place, values in self._wavefronts(groups, starts, 2 * len(self.names)):
             planes = [plane for channels in values.values() for plane in channels]
-            canvas.put(place, planes, some.pixels, some.size)
+            canvas.put(place, planes, some.rays_of(rays.size))
             advance(some.rays)
         return canvas
 
@@ -375,6 +383,8 @@ class Exposer:
     def _at_once(self, groups: Groups, starts: Starts) -> tuple[mi.Point2f, Values]:
         """Trace rays in one wavefront."""
         place, values = self.trace(*groups.lanes(), starts, groups.before)
+        if self.film is not None and not self.film.reach:
+            place = None  # a box takes all rays of a pixel alike
         dr.eval(place, values)
         return place, values
 
@@ -382,15 +392,15 @@ class Exposer:
         """Trace rays in a loop, as scalar variants do."""
         places = list[tuple[float, float]]()
         values = dict[str, list[Any]]()
-        for lane in range(groups.rays):
-            group, number = divmod(lane, groups.size)
-            if groups.first is not None:
-                number += int(groups.first[group])
-            place, traced = self.trace(int(groups.pixels[group]), number, starts, groups.before)
-            heed()
-            places.append((0, 0) if place is None else (place.x, place.y))
-            for name, channels in traced.items():
-                values.setdefault(name, []).append(channels)
+        for entry, pixel in enumerate(groups.pixels):
+            count = 1 if groups.counts is None else int(groups.counts[entry])
+            first = 0 if groups.first is None else int(groups.first[entry])
+            for number in range(first, first + groups.size * count):
+                place, traced = self.trace(int(pixel), number, starts, groups.before)
+                heed()
+                places.append((0, 0) if place is None else (place.x, place.y))
+                for name, channels in traced.items():
+                    values.setdefault(name, []).append(channels)
         return np.array(places).T, {name: list(np.array(planes).T) for name, planes in values.items()}
 
     def trace(

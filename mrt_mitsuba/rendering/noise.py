@@ -16,6 +16,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import mitsuba as mi
 import numpy as np
@@ -23,7 +25,10 @@ import numpy as np
 from mrt_mitsuba.filters.dof import REACH
 from mrt_mitsuba.filters.grid import dilated, window_means
 from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, tail_shape
-from mrt_mitsuba.rendering.exposing import Exposer, FilmStarts, Groups, Independent, Sequences, Stack
+from mrt_mitsuba.plugins import plugin
+from mrt_mitsuba.rays.film import Film
+from mrt_mitsuba.rendering.exposing import Exposer, FilmStarts, Groups, Stack, widened
+from mrt_mitsuba.rendering.progress import Advance
 
 HALVES, SCOUTS = [0, 1], [2, 3]
 SUSPECT = 0.5  # shape of a tail where rare rays may rule
@@ -33,11 +38,16 @@ EVENLY = 0.2  # of the pixels make up noise that is even
 TILE = 16  # pixels that round alike, under a filter: it has rays traced around all that need some
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
 JUDGES = 2**11  # pixels, about, that choose the mixture
+RANKED = 2**12  # pixels, about, by which tenths are found
 LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB
 MISSED = 0.25  # of a pixel like those that make up the noise: it may be among the others, unseen
 STATED = 2  # squared errors that a stated variance counts as much as
 KEPT = 0.75  # of the power by which sequences gain: it falls with their length
 LEAST_RATIO = 0.05  # of squared errors to stated variances, to be believed: rare ones may be missing
+ROUND_TRIPS = 8  # until shares of whole groups fit what there is room for
+FULL = 0.995  # of the room is all of it
+
+Blurred = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -55,372 +65,562 @@ class Forecast:
         return self.noisy > EVENLY and self.tail < SUSPECT
 
 
-class Halves(Stack):
-    """Two half pictures and two scouts, and the moments of the rays in each pixel, as they grow by rounds.
+@dataclass(frozen=True)
+class Sums:
+    """Sums over the rays of each pixel, of one picture or of several together, float32, in ``State.unit``."""
 
-    What to trace in a round: the numbers of groups that each pixel gets in each picture, [4, pixels].
-    """
+    rays: np.ndarray  #: [H, W]
+    total: np.ndarray  #: of colours, [3, H, W]
+    square: np.ndarray  #: of their squares, the mean of the three, [H, W]
 
-    group = 2  #: rays that are traced together
-    begin = (1, 1, 1, 1)  #: groups in each pixel of the first round
-    scouting = (1 / 15, 1 / 4)  #: rays of scouts over those of halves; where rare rays may rule
-    fields = 2  #: of a chessboard of pixels whose rays are independent
-    least = 256  #: mean rays of a pixel that a target takes at least, in a small picture
-    last = False  #: was the last round decided?
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(self.rays + other.rays, self.total + other.total, self.square + other.square)
 
-    def __init__(
-        self, exposer: Exposer, seed: int, blurred: Callable[[np.ndarray], np.ndarray] | None = None
-    ) -> None:
-        film = exposer.film
-        super().__init__(film, 2, len(exposer.names))
-        self._exposer, self._seed, self._blurred = exposer, seed, blurred
-        self.margin = MARGIN_FILTERED if film.reach else MARGIN  #: of a target to aim at
-        self._tile = TILE if film.reach else 1
-        self._board = np.indices(film.shape).sum(0) % (1 if film.reach else self.fields)
-        self._traced = np.zeros((4, film.pixels))
-        self._total = np.zeros((3, 4, *film.shape), np.float32)
-        self._square = np.zeros((4, *film.shape))  # mean of colours, as the next
-        self._peak = np.zeros((4, *film.shape), np.float32)
-        self._scouts = Stack(film, 2, 3) if film.reach else None  # as the filter has them
-        self._earlier: tuple[float, np.ndarray] | None = None
-        self._bad, self._unfit = np.zeros(film.shape, bool), 0.0
+    @cached_property
+    def mean(self) -> np.ndarray:
+        """Mean colours, [3, H, W]."""
+        return np.asarray(self.total / self.rays)
 
-    # ------------------------------------------- Rounds ---------------------------------------------
+    @cached_property
+    def variance(self) -> np.ndarray:
+        """Variance of a ray's value, the mean of its colours, [H, W]."""
+        left = self.square - mean_square(self.mean) * self.rays
+        left[left < np.float32(1e-6) * self.square] = 0  # as far as it is known
+        return np.asarray(left / np.maximum(self.rays - 1, 1))
 
-    def first(self) -> np.ndarray:
-        """Return what to trace in the first round."""
-        return np.repeat([self.begin], self.film.pixels, 0).T
 
-    def cost(self, chosen: np.ndarray) -> int:
-        """Return the number of rays that groups take, with those around the chosen pixels of halves."""
-        return self.group * int(self.widened(chosen[:2]).sum() + chosen[2:].sum())
+@dataclass(frozen=True)
+class State:
+    """What has been exposed: the moments of the rays in each pixel of four pictures, and the pictures."""
 
-    def trace(self, chosen: np.ndarray, advance: Callable[[int], object]) -> None:
-        """Trace groups of rays."""
-        if self.rays.all():
-            _, halves = _compared(self._gathered([0]), self._gathered([1]))
-            self._earlier = self.rays.mean(), halves
-        counts = np.concatenate([self.widened(chosen[:2]), chosen[2:]])
-        groups = Groups.spread(self.group, counts, self._traced)
-        scalar = mi.variant().startswith("scalar")
-        sampling = Independent(self._seed, 2**24) if scalar else Sequences(self._seed)
-        starts = FilmStarts(self.film, sampling)
-        exposed = self._exposer.expose(groups, starts, pictures=4, moments=True, advance=advance)
-        total, peak = exposed.total, exposed.peak  # [3, 4, H, W], [4, H, W]
-        square = exposed.square.mean(0)
-        bad = ~np.isfinite(square)
-        if bad.any():
-            self._bad |= bad.any(0)
-            worst = total[:, bad].max()
-            self._unfit = float(peak[bad].max() if np.isfinite(worst) else worst)
-            for values in (*total, square, peak):
-                values[bad] = 0
-        self._traced += exposed.rays
-        self._total += total
-        self._square += square
-        np.maximum(self._peak, peak, out=self._peak)
-        with np.errstate(invalid="ignore"):
-            self.add(exposed, chosen[:2] > 0)
-            if self._scouts:
-                self._scouts.add(exposed, chosen[2:] > 0, first=2)
+    rays: np.ndarray  #: [4, H, W]
+    total: np.ndarray  #: sums of colours, [3, 4, H, W]
+    square: np.ndarray  #: sums of squares, the mean of the colours, [4, H, W]
+    peak: np.ndarray  #: the mean colour of the brightest ray, [4, H, W]
+    halves: Stack
+    scouts: Stack | None  #: as a filter has them; None under a box
+    bad: np.ndarray  #: met a ray whose colour is no number, or has no square, [H, W]
+    unfit: float  #: the largest of such colours
+    earlier: tuple[float, np.ndarray] | None  #: mean rays and ``differences`` of the halves, a round before
+    exposures: int  #: number of them
 
-    def unfit(self) -> str:
-        """Return what radiance has no square in float32, and where; nothing if all has."""
-        bad = np.argwhere(self._inside(self._bad))
-        if not len(bad):
-            return ""
-        where = f"{len(bad)} pixels, the first at row {bad[0, 0]}, column {bad[0, 1]}"
-        return f"radiance of {self._unfit:.3g} was met in {where}: they are left out of the error"
+    @classmethod
+    def blank(cls, film: Film, channels: int) -> State:
+        """Nothing."""
+        four = (4, *film.shape)
+        return cls(
+            rays=np.zeros(four),
+            total=np.zeros((3, *four), np.float32),
+            square=np.zeros(four),
+            peak=np.zeros(four, np.float32),
+            halves=Stack.blank(film, 2, channels),
+            scouts=Stack.blank(film, 2, 3) if film.reach else None,
+            bad=np.zeros(film.shape, bool),
+            unfit=0.0,
+            earlier=None,
+            exposures=0,
+        )
 
-    def maps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the picture [H, W, 3], and the standard error and the rays of each pixel, [H, W]."""
-        image = self.mean()[..., :3]
-        shown = image if self._blurred is None else self._blurred(image)
-        return shown, np.sqrt(self.variance().mean(-1)), self.samples()
+    @cached_property
+    def unit(self) -> float:
+        """Mean square of a ray, in which variances are given: squares of them fit into single precision.
+
+        As the scouts have it, so that no value in the picture decides the last bit of a share.
+        """
+        return float(self.square[SCOUTS].sum() / max(self.rays[SCOUTS].sum(), 1)) or 1.0
+
+    @cached_property
+    def _each(self) -> list[Sums]:
+        """Those of each picture."""
+        rays = self.rays.astype(np.float32)
+        total = self.total * np.float32(self.unit**-0.5)
+        square = (self.square / self.unit).astype(np.float32)
+        return [Sums(rays[picture], total[:, picture], square[picture]) for picture in range(len(rays))]
+
+    def sums(self, first: int, second: int | None = None) -> Sums:
+        """Those of a picture, or of two together."""
+        return self._each[first] if second is None else self._each[first] + self._each[second]
+
+    @cached_property
+    def differing(self) -> np.ndarray:
+        """The halves' ``differences``."""
+        return differences(self.sums(0), self.sums(1))
 
     def samples(self) -> np.ndarray:
-        """Return the rays of each pixel, those of scouts included, [H, W], without the border."""
-        return self._inside(self.rows(self._traced).sum(0))
+        """The rays of each pixel, those of scouts included, [H, W], without the border."""
+        return self.inside(self.rays.sum(0))
 
-    # ------------------------------------------- Errors ---------------------------------------------
+    def image(self) -> np.ndarray:
+        """The mean of the halves, [H, W, channels], without the border."""
+        return self.halves.mean()
 
-    def squares(self) -> np.ndarray:
-        """Return the squared errors of pixels, by the halves alone, [H, W], without the border."""
-        halves = self.film.picture(self.pictures()[..., :3])
-        if self._blurred is not None:
-            halves = np.stack([self._blurred(half) for half in halves])
-        return np.where(self._inside(self._unknown), 0, quarter_squares(*halves).mean(-1))
+    @cached_property
+    def channels(self) -> np.ndarray:
+        """Squared errors of the picture's channels, by the halves alone, [3, H, W], with the border."""
+        sums = self.halves.sums[:3]
+        weights = np.where(self.halves.weights == 0, 1, self.halves.weights)
+        squares = quarter_squares(sums[:, 0] / weights[0], sums[:, 1] / weights[1])
+        squares[:, self.unknown] = 0
+        return squares
 
-    def error(self) -> ErrorEstimate:
-        """Return the estimated RMSE with its interval, and the tail of what single rays contribute.
-
-        It is a mean of squares, each as uncertain as it is large, correlated as the filter has it; the true
-        error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law,
-        wider upwards the fewer squares make up the mean.
-        """
-        squares, correlation, tail = self.squares(), self.film.correlation, self._tail(HALVES)
-        rmse = math.sqrt(float(squares.mean()))
-        if self._blurred is not None:  # pixels are as good as one in a window of the blur's reach
-            correlation = 1.0
-            for axis in (0, 1):
-                squares = np.add.reduceat(squares, range(0, squares.shape[axis], 2 * REACH), axis)
-        spread = math.sqrt(2 * correlation * float(np.square(squares).sum())) / max(squares.sum(), 1e-300)
-        width = 1.96 * spread / 2
-        high = rmse * math.exp(width * (1 + spread)) if tail <= DOUBTFUL else math.inf
-        return ErrorEstimate(rmse, rmse * math.exp(-width), high, tail)
+    def squares(self, blurred: Blurred | None) -> np.ndarray:
+        """Squared errors of pixels, by the halves alone, [H, W], without the border."""
+        if blurred is None:
+            return self.inside(self.channels.mean(0))
+        halves = [blurred(half) for half in self.halves.film.picture(self.halves.pictures()[..., :3])]
+        return np.where(self.inside(self.unknown), 0, quarter_squares(*halves).mean(-1))
 
     def luminance(self) -> float:
         """The mean luminance of the picture, as the scouts have it, which no value in the picture decides."""
-        rays, total, _ = self._gathered(SCOUTS)
-        colors = self.film.picture(np.moveaxis(total / rays, 0, -1))
+        total = self.total[:, SCOUTS].sum(1) / self.rays[SCOUTS].sum(0)
+        colors = self.halves.film.picture(np.moveaxis(total, 0, -1))
         return float(colors.mean((0, 1)) @ LUMINANCE)
 
-    def forecast(self) -> Forecast:
-        """The error of the picture as the scouts foresee it."""
-        variance = self._decisive([2], [3])
-        left = self._inside(variance / self.rows(self.rays).sum(0))
-        noisy = _number(_variance(self._gathered(SCOUTS))) / self.film.pixels
-        return Forecast(math.sqrt(float(left.mean())), self._tail(SCOUTS), noisy, variance)
+    def unfit_rays(self) -> str:
+        """Radiance that has no square in float32, and where; nothing if all has."""
+        bad = np.argwhere(self.inside(self.bad))
+        if not len(bad):
+            return ""
+        where = f"{len(bad)} pixels, the first at row {bad[0, 0]}, column {bad[0, 1]}"
+        return f"radiance of {self.unfit:.3g} was met in {where}: they are left out of the error"
 
-    def variance(self) -> np.ndarray:
-        """Return the estimated variance of each channel in the picture, [H, W, 3], without the border."""
-        each = self._decisive([0, 2], [1, 3], missed=2 * MISSED) * (1 / self.rows(self.rays)).sum(0) / 4
-        colors = np.where(self._unknown[..., None], 0, quarter_squares(*self.pictures()[..., :3]))
-        total = _calibrated(self.film.spread_out(each), colors.mean(-1))
-        colors = window_means(np.moveaxis(colors, -1, 0), 4) + 1e-30
-        variance = np.moveaxis(total * colors / colors.mean(0), 0, -1)
-        rounding = np.nan_to_num(np.square(2.0**-24 * self.mean()[..., :3], dtype=np.float64), posinf=0)
-        return self.film.picture(variance) + rounding
+    @property
+    def unknown(self) -> np.ndarray:
+        """Where the picture is no number, or one that has no square, [H, W]."""
+        return dilated(self.bad, self.halves.film.reach)
 
-    def _decisive(
+    def inside(self, values: np.ndarray) -> np.ndarray:
+        """Values [H, W] without the border."""
+        return self.halves.film.picture(values[..., None])[..., 0]
+
+
+class Noise(Protocol):
+    """Estimates the error of two half pictures, and decides what to trace to lessen it.
+
+    What to trace is given as numbers of groups, [4, pixels]: of the halves, then of the scouts.
+    """
+
+    film: Film
+    blurred: Blurred | None  #: what is done to the picture in the end, by which errors are judged
+    margin: float  #: of a target to aim at
+    least: float  #: mean rays of a pixel that a target takes at least, in a small picture
+    begin: np.ndarray  #: what to trace first
+
+    def blank(self) -> State:
+        """What is known before anything is traced."""
+        ...
+
+    def cost(self, chosen: np.ndarray) -> int:
+        """The rays that it takes."""
+        ...
+
+    def trace(self, state: State, chosen: np.ndarray, advance: Advance) -> State:
+        """What is known after tracing it as well."""
+        ...
+
+    def tail(self, state: State, pictures: Sequence[int]) -> float:
+        """Pareto shape of what rays contribute to some pictures."""
+        ...
+
+    def forecast(self, state: State) -> Forecast:
+        """The error of the picture, as the scouts foresee it."""
+        ...
+
+    def wanted(self, state: State, forecast: Forecast, target: float) -> float:
+        """Mean rays of a pixel, in all, that take the picture to an RMSE, as the scouts foresee it."""
+        ...
+
+    def shares(self, state: State, forecast: Forecast, most: float, even: float) -> np.ndarray:
+        """What takes the mean rays of a pixel to ``most``, decided by the scouts alone.
+
+        No pixel is taken for less noisy than ``even`` times the mean.
+        """
+        ...
+
+    def last_shares(self, state: State, most: float, target: float | None) -> np.ndarray:
+        """What takes the picture to an RMSE, or the mean rays of a pixel to ``most``, for the last round.
+
+        The halves decide for each other: what one makes of the other's share cannot come back to it any more.
+        """
+        ...
+
+    def variance(self, state: State) -> np.ndarray:
+        """The estimated variance of each channel in the picture, [H, W, 3], without the border."""
+        ...
+
+
+def estimate(noise: Noise, state: State) -> ErrorEstimate:
+    """The estimated RMSE with its interval, and the tail of what single rays contribute.
+
+    It is a mean of squares, each as uncertain as it is large, correlated as the filter has it; the true
+    error is a mean of as many squares, and as uncertain. The interval is that of a log-normal law,
+    wider upwards the fewer squares make up the mean.
+    """
+    squares = state.squares(noise.blurred)
+    correlation = noise.film.correlation
+    tail = noise.tail(state, HALVES)
+    rmse = math.sqrt(float(squares.mean()))
+    if noise.blurred is not None:  # pixels are as good as one in a window of the blur's reach
+        correlation = 1.0
+        for axis in (0, 1):
+            squares = np.add.reduceat(squares, range(0, squares.shape[axis], 2 * REACH), axis)
+    spread = math.sqrt(2 * correlation * float(np.square(squares).sum())) / max(squares.sum(), 1e-300)
+    width = 1.96 * spread / 2
+    high = rmse * math.exp(width * (1 + spread)) if tail <= DOUBTFUL else math.inf
+    return ErrorEstimate(rmse, rmse * math.exp(-width), high, tail)
+
+
+class RayNoise:
+    """The noise of rays, each in a pixel that is chosen for it. See ``Noise``."""
+
+    least = 256.0
+    scouting = (1 / 15, 1 / 4)  #: rays of scouts over those of halves; where rare rays may rule
+
+    def __init__(self, exposer: Exposer, seed: int, blurred: Blurred | None = None) -> None:
+        self.film: Film = exposer.film
+        self.blurred = blurred
+        self.margin = MARGIN_FILTERED if self.film.reach else MARGIN
+        self._exposer = exposer
+        self._seed = seed
+        samplers = plugin("samplers", "mrt_mitsuba.rays")
+        self._sampler = mi.load_dict({"type": samplers.ADAPTIVE})
+        self._group = self._sampler.group
+        self.begin = np.ones((4, self.film.pixels), np.int64)
+        # under a filter, pixels share rays
+        fields = 1 if self.film.reach else self._sampler.fields
+        board = np.indices(self.film.shape).sum(0) % fields
+        self._fields = [board == field for field in range(fields)]
+
+    # ------------------------------------------- Tracing --------------------------------------------
+
+    def blank(self) -> State:
+        return State.blank(self.film, len(self._exposer.names))
+
+    def cost(self, chosen: np.ndarray) -> int:
+        return self._group * int(self._traced(chosen).sum())
+
+    def _traced(self, chosen: np.ndarray) -> np.ndarray:
+        """What is chosen, with groups around the chosen pixels of halves as far as the filter reaches."""
+        return np.concatenate([widened(self.film, chosen[:2]), chosen[2:]])
+
+    def trace(self, state: State, chosen: np.ndarray, advance: Advance) -> State:
+        groups = Groups.shared_out(self._group, self._traced(chosen), state.rays)
+        starts = FilmStarts(self.film, self._seed, self._sampler)
+        exposed = self._exposer.expose(groups, starts, pictures=4, moments=True, advance=advance)
+        total, peak = exposed.total, exposed.peak
+        square = exposed.square.mean(0)
+        bad, unfit = state.bad, state.unfit
+        new = ~np.isfinite(square)
+        if new.any():
+            bad = bad | new.any(0)
+            worst = total[:, new].max()
+            unfit = float(peak[new].max() if np.isfinite(worst) else worst)
+            for values in (*total, square, peak):
+                values[new] = 0
+        scouts = state.scouts
+        earlier = None
+        if state.rays.all():
+            earlier = float(state.rays[0].mean()), state.differing
+        with np.errstate(invalid="ignore"):
+            halves = state.halves.plus(exposed, chosen[:2] > 0)
+            if scouts is not None:
+                scouts = scouts.plus(exposed, chosen[2:] > 0, first=2)
+        return State(
+            rays=state.rays + exposed.rays.reshape(state.rays.shape),
+            total=state.total + total,
+            square=state.square + square,
+            peak=np.maximum(state.peak, peak),
+            halves=halves,
+            scouts=scouts,
+            bad=bad,
+            unfit=unfit,
+            earlier=earlier,
+            exposures=state.exposures + 1,
+        )
+
+    # ------------------------------------------- Errors ---------------------------------------------
+
+    def tail(self, state: State, pictures: Sequence[int]) -> float:
+        """Of each pixel the brightest ray is known; the others are taken for alike, given all squares."""
+        each = [state.sums(picture) for picture in pictures]
+        rays = np.stack([sums.rays for sums in each])
+        variance = np.stack([sums.variance for sums in each])
+        means = np.stack([sums.mean.mean(0) for sums in each])
+        peak = state.peak[list(pictures)] * np.float32(state.unit**-0.5)
+        most = np.maximum(peak - means, 0)
+        others = np.sqrt(np.maximum(variance - most**2 / np.maximum(rays - 1, 1), 0))
+        values = np.stack([most / rays, others / rays])
+        counts = np.stack([np.ones_like(rays), rays - 1])
+        return tail_shape(values.ravel(), counts.ravel())
+
+    def forecast(self, state: State) -> Forecast:
+        variance = self._variance_of_rays(state, state.sums(2), state.sums(3))
+        left = state.inside(variance / state.rays[:2].sum(0))
+        noisy = number_of(state.sums(*SCOUTS).variance) / self.film.pixels
+        return Forecast(math.sqrt(float(left.mean())), self.tail(state, SCOUTS), noisy, variance)
+
+    def variance(self, state: State) -> np.ndarray:
+        each = self._variance_of_rays(state, state.sums(0, 2), state.sums(1, 3), missed=2 * MISSED)
+        each *= (1 / state.rays[:2]).sum(0) / 4
+        total = _calibrated(self.film.spread_out(each), state.channels.mean(0))
+        near = window_means(state.channels, 4) + 1e-30
+        variance = np.moveaxis(total * near / near.mean(0), 0, -1)
+        rounding = np.square(2.0**-24 * state.image()[..., :3], dtype=np.float64)
+        return self.film.picture(variance) + np.nan_to_num(rounding, posinf=0)
+
+    def _variance_of_rays(
         self,
-        first: list[int],
-        second: list[int],
+        state: State,
+        first: Sums,
+        second: Sums,
         near: np.ndarray | None = None,
         missed: float = MISSED,
     ) -> np.ndarray:
-        """Return the variance of a pixel times its rays, [H, W], as two sets of pictures have it.
+        """The variance of a pixel times its rays, [H, W], as two sets of rays have it.
 
         Pixels that met no rare bright ray look quiet, so each borrows from windows around it, and from the
         picture: in the mixture of the first set that explains best what the second measures. Rays of a
         sequence err less than independent ones: by that much, the sets differ less than their rays do.
-        ``near``: these differences of other sets, which show it better, [..., 2, H, W], for as many results.
-        ``missed``: see ``MISSED``; what is stated counts it twice.
+        ``near``: the ``differences`` of other sets around each pixel, which show it better, [..., 2, H, W],
+        for as many results. ``missed``: see ``MISSED``; what is stated counts it twice.
         """
-        one, another = self._gathered(first), self._gathered(second)
-        (both, own), seen, measured = _compared(one, another), _variance(one), _variance(another)
+        seen = first.variance
+        measured = second.variance
+        both = (first + second).variance
         parts, more = self._around(np.stack([seen, both]))
         shares = _mixture(parts, measured)
-        shares[0] = max(shares[0], missed / max(_number(both), 1))
-        mixed = np.tensordot(shares, more, 1)
+        shares[0] = max(shares[0], missed / max(number_of(both), 1))
+        mixed = np.tensordot(shares.astype(np.float32), more, 1)
         quiet, also = window_means(np.stack([seen, measured]), 1) == 0
         if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
             mixed[quiet & also] = 0
-        near = _near(own, WINDOWS[3:]) if near is None else near
-        # where there is no noise near, all of the picture
-        found, expected = np.moveaxis(near + 1e-3 * own.mean((-2, -1), keepdims=True), -3, 0)
-        ratio = self.film.even * found / np.maximum(expected, 1e-30) + self._uneven()
-        return np.asarray(mixed * ratio * self.film.averaging)
+        if near is None:
+            near = _nearby(differences(first, second), WINDOWS[3:])
+        ratio = self.film.even * _ratios(near) + self._uneven(state)
+        return np.asarray(mixed * ratio * np.float32(self.film.averaging * state.unit))
 
-    def _uneven(self) -> float:
+    def _uneven(self, state: State) -> float:
         """What the filter's change within a pixel adds to the ratio of a pixel's variance to that of
         independent rays, as the scouts have it.
 
         Values that depend on other dimensions gain nothing there by an even sequence, edges do.
         """
-        if self._scouts is None:
+        if state.scouts is None:
             return 0.0
         rest = 1 - self.film.even
-        _, (found, expected) = _compared(self._gathered([2]), self._gathered([3]))
-        squares = np.where(self._unknown, 0, quarter_squares(*self._scouts.pictures()).mean(-1)).mean()
-        added = squares / self.film.averaging - self.film.even * found.mean()
-        return float(np.clip(added / max(expected.mean(), 1e-300), 0, rest))
+        found, expected = differences(state.sums(2), state.sums(3)).mean((1, 2), dtype=np.float64)
+        squares = quarter_squares(*state.scouts.pictures()).mean(-1)
+        seen = np.where(state.unknown, 0, squares).mean() / state.unit
+        added = seen / self.film.averaging - self.film.even * found
+        return float(np.clip(added / max(expected, 1e-300), 0, rest))
 
     def _around(self, values: np.ndarray) -> np.ndarray:
-        """Return values [..., H, W], their means in windows, and the mean of all, [..., parts, H, W]."""
-        parts = [values * 0 + values.mean((-2, -1), keepdims=True)] + ([] if self.film.reach else [values])
+        """Values [..., H, W], their means in windows, and the mean of all, [parts, ..., H, W] of the last
+        but two axes first."""
+        parts = [values * 0 + values.mean((-2, -1), keepdims=True)]
+        if not self.film.reach:
+            parts.append(values)
         parts += [window_means(values, width) for width in WINDOWS if width >= self.film.reach]
         return np.stack(parts, -3)
 
-    def _gathered(self, which: list[int]) -> list[np.ndarray]:
-        """Return the rays of some pictures together, [H, W], the sums of their colours, [3, H, W], and those
-        of squares, [H, W]."""
-        return [v[..., which, :, :].sum(-3) for v in (self.rows(self._traced), self._total, self._square)]
-
-    def _tail(self, which: list[int]) -> float:
-        """Return the Pareto shape of what single rays contribute to the pixels of some pictures.
-
-        Of each pixel the brightest ray is known; the others are taken for alike, given all squares.
-        """
-        sums = self.rows(self._traced)[which], self._total[:, which], self._square[which]
-        rays, total, _ = sums
-        most = np.maximum(self._peak[which] - total.mean(0) / rays, 0)
-        others = np.sqrt(np.maximum(_variance(sums) - most**2 / np.maximum(rays - 1, 1), 0))
-        values, counts = np.stack([most, others]) / rays, np.stack([np.ones_like(rays), rays - 1])
-        return tail_shape(values.ravel(), counts.ravel())
-
-    @property
-    def _unknown(self) -> np.ndarray:
-        """Where the picture is no number, or one that has no square, [H, W]."""
-        return dilated(self._bad, self.film.reach)
-
     # ------------------------------------------- Sharing --------------------------------------------
 
-    def next(
-        self,
-        forecast: Forecast | None,
-        most: float,
-        rays: float,
-        target: float | None = None,
-        even: float = 0,
-    ) -> np.ndarray:
-        """Numbers of further groups; without a forecast, of the last round.
+    def wanted(self, state: State, forecast: Forecast, target: float) -> float:
+        deviation = np.sqrt(forecast.variance, dtype=np.float64)
+        half = np.maximum(deviation * (deviation.mean() / (2 * target**2)), state.rays[0])
+        return float(2 * (half - state.rays[0]).mean() + state.rays.sum(0).mean())
 
-        The scouts decide until ``most`` rays a pixel are enough for an RMSE of ``target``, or are all of the
-        ``rays`` to spend. The next round is the last then, and what a half gets in it is decided by the other
-        half, too: that knows more, and what it makes of this half's share cannot come back to it any more.
-        How much less a sequence errs, the halves show best: in pixels of the other colour of a chessboard,
-        so that no value moves its own weight. Before the last round, no pixel is taken for less noisy than
-        ``even`` times the mean.
-        """
-        room = most * self.film.pixels - self._traced.sum()
-        self.last = forecast is None or most >= rays
-        if forecast is not None and target is not None:
-            deviation = np.sqrt(forecast.variance.ravel())
-            wanted = np.maximum(deviation * deviation.mean() / (2 * target**2) - self.rays[0], 0)
-            self.last = self.last or wanted.sum() <= room / 2
-        if forecast is not None and not self.last:
-            scouting = self.scouting[forecast.tail >= SUSPECT]
-            room, everywhere = room / 2 / (1 + scouting), np.ones(self.film.shape, bool)
-            half = self._share(0, forecast.variance, room, None, everywhere, even)
-            wanted = scouting * (self.rays[0] + self.group * half)
-            scouts = self._due(wanted, self._traced[2], self._rounding())
-            return np.stack([half, half, scouts, scouts])
-        room += (rays - most) * self.film.pixels
-        fields = np.stack([self._board == field for field in range(self._board.max() + 1)])
-        _, halves = _compared(self._gathered([0]), self._gathered([1]))
-        near = _near(halves * ~fields[:, None], WINDOWS[2:]) if len(fields) > 1 else None
-        each = (1 / self.rows(self.rays)).sum(0) / 4  # of a ray's variance is in the squares of halves
+    def shares(self, state: State, forecast: Forecast, most: float, even: float) -> np.ndarray:
+        scouting = self.scouting[forecast.tail >= SUSPECT]
+        room = self._room(state, most) / 2 / (1 + scouting)
+        rounding = self._rounding(state)
+        deviation = _smoothed(forecast.variance)
+        deviation = np.maximum(deviation, even * deviation.mean())
+        half = self._share(state.rays[0], deviation, room, rounding)
+        wanted = scouting * (state.rays[0].ravel() + self._group * half)
+        scouts = self._due(wanted, state.rays[2].ravel(), rounding.ravel())
+        return np.stack([half, half, scouts, scouts])
+
+    def last_shares(self, state: State, most: float, target: float | None) -> np.ndarray:
+        """What a half takes in a field is corrected by pixels of the others, so that no value moves its own
+        weight; under a filter no pixel can do so."""
+        room = self._room(state, most) / 2
+        rounding = self._rounding(state)
+        scouts = state.sums(*SCOUTS)
+        alone = len(self._fields) == 1
+        near = None if alone else np.stack([_nearby(state.differing * ~f, WINDOWS[2:]) for f in self._fields])
         chosen = np.zeros((4, self.film.pixels), np.int64)
         for index in HALVES:
-            views = self._decisive([1 - index], SCOUTS, near).reshape(fields.shape)
-            for field, variance in zip(fields, views, strict=True):
-                gain = 0.0
-                if near is not None:
-                    variance = _calibrated(variance * each, halves[0], ~field) / each
-                    gain = self._gain(~field, halves)
-                chosen[index] += self._share(index, variance, room / 2 * field.mean(), target, field, 0, gain)
+            have = state.rays[index]
+            found = self._variance_of_rays(state, state.sums(1 - index), scouts, near)
+            if near is None:
+                deviation = _smoothed(found)
+                factor = math.inf
+                if target is not None:
+                    factor = _factor(deviation, found, have, room, 2 * target**2)
+                chosen[index] = self._share(have, deviation, room, rounding, factor)
+                continue
+            for field, less, variance in zip(self._fields, _ratios(near), found, strict=True):
+                deviation, factor = self._by_others(state, index, ~field, variance, less, room, target)
+                part = room * field.mean()
+                chosen[index] += self._share(have, deviation, part, rounding, factor, field)
         return chosen
 
-    def _gain(self, among: np.ndarray, halves: np.ndarray) -> float:
-        """By what power of the rays, beyond the first, variance falls in some pixels [H, W].
+    def _by_others(
+        self,
+        state: State,
+        index: int,
+        others: np.ndarray,
+        variance: np.ndarray,
+        less: np.ndarray,
+        room: float,
+        target: float | None,
+    ) -> tuple[np.ndarray, float]:
+        """Deviations of a ray, [H, W], and by what to multiply them for the rays of a half, as pixels of the
+        other fields have it.
 
-        ``halves``: their squares, and what these are for independent rays, [2, H, W]; the same is known of
-        the round before.
+        A pixel that is taken for noisy by chance gets many rays, and seems to be left little noise. So the
+        rays of the half itself, which do not decide the shares of their pixels, tell what these leave there.
+        ``variance``: of rays, by the other pictures; ``less``: by what a sequence divides it; [H, W].
         """
-        if self._earlier is None:
+        errors = state.differing[0]
+        # of a ray's variance in these squares
+        weight = np.float32((1 / state.rays[HALVES]).sum(0) / (4 * state.unit))
+        deviation = _smoothed(_calibrated(variance * weight, errors, others) / weight)
+        if target is None:
+            return deviation, math.inf
+        own = state.sums(index).variance * less * np.float32(state.unit)
+        expected = state.differing[1] * less
+        own *= _calibrated(expected, errors, others) / np.maximum(expected, 1e-30)
+        own = own[others] * _drawn((own * weight)[others], errors[others])
+        gain = self._gain(state, others)
+        part = room * others.mean()
+        return deviation, _factor(
+            deviation[others], own, state.rays[index][others], part, 2 * target**2, gain
+        )
+
+    def _gain(self, state: State, among: np.ndarray) -> float:
+        """By what power of the rays, beyond the first, variance falls in some pixels [H, W]: as it fell since
+        the round before."""
+        if state.earlier is None:
             return 0.0
-        rays, earlier = self._earlier
-        now, then = (values[:, among].sum(1) for values in (halves, earlier))
-        if min(*now, *then) <= 0:
+        rays, earlier = state.earlier
+        weights = among.ravel().astype(np.float32)
+        now, then = (values.reshape(2, -1) @ weights for values in (state.differing, earlier))
+        growth = float(state.rays[0].mean()) / rays
+        if min(*now, *then) <= 0 or growth < 1.5:  # less tells nothing
             return 0.0
-        power = math.log(then[0] / then[1] * now[1] / now[0]) / math.log(self.rays.mean() / rays)
-        return KEPT * min(max(power, 0.0), 0.5)
+        power = math.log(then[0] / then[1] * now[1] / now[0]) / math.log(growth)
+        return KEPT * min(max(power, 0.0), self._sampler.gain)
+
+    def _room(self, state: State, most: float) -> float:
+        return most * self.film.pixels - float(state.rays.sum())
 
     def _share(
         self,
-        half: int,
-        variance: np.ndarray,
+        have: np.ndarray,
+        deviation: np.ndarray,
         room: float,
-        target: float | None,
-        among: np.ndarray,
-        even: float,
-        gain: float = 0.0,
+        rounding: np.ndarray,
+        factor: float = math.inf,
+        among: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return groups for a half: what a target takes, if the other half is like this one, or nearly, but
-        no more than, what there is room for. Rays are a multiple of the deviation, or what there is."""
-        deviation = window_means(np.sqrt(variance + 1e-30), 1)[among]  # single pixels are known badly
-        deviation = np.maximum(deviation, even * deviation.mean())
-        have, rounding, variance = (
-            v.reshape(among.shape)[among] for v in (self.rays[half], self._rounding(), variance)
-        )
-        low, high, best = 0.0, (room + have.sum()) / deviation.sum(), np.zeros(len(have), np.int64)
-        if target is not None:
-            high = min(high, deviation.mean() / (2 * target**2))
-        factor = high
-        for _ in range(12):
-            groups = self._due(factor * deviation, have, rounding)
-            fits = self.group * self.widened(groups[None]).sum() <= room
-            best = groups if fits else best
-            rays = have + self.group * groups
-            left = variance / rays * (have / rays) ** gain
-            if fits and (target is None or left.mean() > 2 * target**2):
+        """Groups for a half that has some rays, [pixels]: what makes of them a multiple of the deviation, but
+        no more than there is room for.
+
+        ``have``, ``deviation``, ``rounding``: [H, W]. ``among``: the pixels that share, [H, W]; None: all.
+        """
+        some = slice(None) if among is None else np.flatnonzero(among)
+        deviation = deviation.ravel()[some]
+        have = have.ravel()[some]
+        rounding = rounding.ravel()[some]
+        known = have.sum()
+        best = np.zeros(self.film.pixels, np.int64)
+        low = 0.0
+        high = min(factor, (room + known) / deviation.sum())
+        factor = min(factor, _factor(deviation, None, have, room, 0.0))
+        for _ in range(ROUND_TRIPS):
+            groups = np.zeros(self.film.pixels, np.int64)
+            groups[some] = self._due(factor * deviation, have, rounding)
+            cost = self._group * float(widened(self.film, groups[None]).sum())
+            if cost <= room:
+                best = groups
                 low = factor
+                if cost > FULL * room or factor == high:
+                    break
             else:
                 high = factor
-            factor = (low + high) / 2
-        shares = np.zeros(among.shape, np.int64)
-        shares[among] = best
-        return shares.ravel()
+            factor *= (room + known) / (cost + known)
+            if not low < factor < high:
+                factor = (low + high) / 2
+        return best
 
-    def _rounding(self) -> np.ndarray:
-        """Return random numbers to add before rounding down, alike in a tile."""
-        rows, columns = (np.arange(n) // self._tile for n in self.film.shape)
-        random = np.random.default_rng((self._seed, int(self._traced.sum())))
-        return random.random((rows[-1] + 1, columns[-1] + 1))[rows[:, None], columns].ravel()
+    def _rounding(self, state: State) -> np.ndarray:
+        """Random numbers to add before rounding down, alike in a tile, [H, W]."""
+        tile = TILE if self.film.reach else 1
+        rows, columns = (np.arange(n) // tile for n in self.film.shape)
+        random = np.random.default_rng((self._seed, int(state.rays.sum())))
+        return random.random((rows[-1] + 1, columns[-1] + 1), np.float32)[rows[:, None], columns]
 
     def _due(self, rays: np.ndarray, have: np.ndarray, rounding: np.ndarray) -> np.ndarray:
-        """Return the groups that make of the rays there are so many.
-
-        Or a multiple of a power of two near it, an eighth to a quarter of it: a sequence errs less then.
-        """
+        """Groups that make a number of rays of what there is: one near it that suits the sampler."""
         rays = np.minimum(rays, 2.0**40)
-        step = np.ldexp(0.125, np.maximum(np.frexp(rays)[1], 4))
+        step = self._sampler.spacing(rays)
         due = np.floor(rays / step + rounding) * step - have
-        return np.asarray(np.maximum(due, 0) / self.group, np.int64)
-
-    def _inside(self, values: np.ndarray) -> np.ndarray:
-        return self.film.picture(values[..., None])[..., 0]
+        return np.asarray(np.maximum(due, 0) / self._group, np.int64)
 
 
 def quarter_squares(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return a quarter of the squared difference of pictures; what is no number is left out later."""
+    """A quarter of the squared difference of pictures; what is no number is left out later."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.asarray(np.square(first - second, dtype=np.float64) / 4)
 
 
-def _compared(one: Sequence[np.ndarray], another: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the variance of the rays of two sets, given sums as of ``_gathered``; and a quarter of their
-    squared difference, and what it is for independent rays, [2, H, W]."""
-    variance = _variance([a + b for a, b in zip(one, another, strict=True)])
-    found = quarter_squares(*(total / rays for rays, total, _ in (one, another))).mean(0)
-    return variance, np.stack([found, variance * (1 / one[0] + 1 / another[0]) / 4])
+def differences(one: Sums, another: Sums) -> np.ndarray:
+    """A quarter of the squared difference of two pictures, the mean of its colours, and what it is for
+    independent rays, [2, H, W]."""
+    found = mean_square(one.mean - another.mean) / 4
+    return np.stack([found, (one + another).variance * (1 / one.rays + 1 / another.rays) / 4])
 
 
-def _near(values: np.ndarray, widths: Sequence[int]) -> np.ndarray:
-    """Return what values [..., H, W] are around each pixel, a little of the mean of all among it."""
-    return np.asarray(
-        np.mean([window_means(values, width) for width in widths], 0)
-        + 0.2 * values.mean((-2, -1), keepdims=True)
-    )
+def mean_square(colors: np.ndarray) -> np.ndarray:
+    """The mean of the squares of three channels, [H, W]."""
+    return np.asarray((colors[0] ** 2 + colors[1] ** 2 + colors[2] ** 2) / 3)
 
 
-def _variance(sums: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the variance of a ray's value, the mean of its colours, given sums as of ``_gathered``."""
-    rays, total, square = sums
-    variance = (square - np.square(total, dtype=np.float64).mean(0) / rays) / np.maximum(rays - 1, 1)
-    return np.where(variance * rays > 1e-6 * square, variance, 0)
+def number_of(values: np.ndarray) -> float:
+    """How many values make up their sum: all if they are equal, one if it rules."""
+    flat = values.ravel()
+    return float(flat.sum(dtype=np.float64) ** 2 / max(float(flat @ flat), 1e-300))
+
+
+def _smoothed(variance: np.ndarray) -> np.ndarray:
+    """Deviations around each pixel, [H, W]: those of single pixels are known badly."""
+    return window_means(np.sqrt(variance + 1e-30), 1)
+
+
+def _ratios(near: np.ndarray) -> np.ndarray:
+    """By what a sequence divides the variance, given ``differences`` around pixels [..., 2, H, W]."""
+    return np.asarray(near[..., 0, :, :] / np.maximum(near[..., 1, :, :], 1e-30))
+
+
+def _nearby(values: np.ndarray, widths: Sequence[int]) -> np.ndarray:
+    """Means of values [..., H, W] around each pixel, with a little of the mean of all."""
+    near = sum(window_means(values, width) for width in widths) / len(widths)
+    return np.asarray(near + 0.2 * values.mean((-2, -1), keepdims=True))
 
 
 def _mixture(parts: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the shares, 0 or more, in which parts [parts, H, W] add up to what is nearest to values [H, W].
+    """The shares, 0 or more, in which parts [parts, H, W] add up to what is nearest to values [H, W].
 
     By W. Richardson's and L. Lucy's steps (1972, 1974), in which a value weighs the less the more is expected
     of it, since a variance is as uncertain as it is large.
     """
-    step, tiny = max(1, math.isqrt(measured.size // JUDGES)), 1e-6 * measured.mean() + 1e-30
-    known = parts[:, ::step, ::step].reshape(len(parts), -1) + tiny
-    values, shares = measured[::step, ::step].ravel() + tiny, np.full(len(parts), 1 / len(parts))
+    step = max(1, math.isqrt(measured.size // JUDGES))
+    tiny = 1e-6 * measured.mean() + 1e-30
+    known = parts[:, ::step, ::step].reshape(len(parts), -1).astype(np.float64) + tiny
+    values = measured[::step, ::step].ravel() + tiny
+    shares = np.full(len(parts), 1 / len(parts))
     for _ in range(30):
         expected = shares @ known
         weights = 1 / np.sqrt(expected)
@@ -429,7 +629,7 @@ def _mixture(parts: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def _calibrated(variance: np.ndarray, squares: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
-    """Return variances [H, W], each tenth of them, as they sort, drawn to the mean of its squared errors.
+    """Variances [H, W], each tenth of them, as they sort, drawn to the mean of its squared errors.
 
     The more squares make up that mean, the more: a tenth in which both halves missed the same rare rays has
     none, and keeps what was stated. ``among``: the pixels whose squares count, [H, W]; None: all.
@@ -437,11 +637,12 @@ def _calibrated(variance: np.ndarray, squares: np.ndarray, among: np.ndarray | N
     noisy = variance > 0
     if not noisy.any():
         return variance.copy()
-    edges = np.quantile(variance[noisy], np.arange(1, 10) / 10)
+    step = max(1, variance.size // RANKED)
+    edges = np.quantile(variance[noisy][::step], np.arange(1, 10) / 10)
     tenth = np.searchsorted(edges, variance)  # of each pixel, 0 to 9
     judging = noisy if among is None else noisy & among
     judged = tenth[judging]
-    errors = squares[judging]
+    errors = squares[judging].astype(np.float64)
     stated = np.bincount(judged, variance[judging], 10)
     measured = np.bincount(judged, errors, 10)
     number = measured**2 / np.maximum(np.bincount(judged, np.square(errors), 10), 1e-300)
@@ -450,6 +651,42 @@ def _calibrated(variance: np.ndarray, squares: np.ndarray, among: np.ndarray | N
     return np.asarray(variance * drawn[tenth])
 
 
-def _number(values: np.ndarray) -> float:
-    """Return how many values make up their sum: all if they are equal, one if it rules."""
-    return float(values.sum() ** 2 / max(np.square(values).sum(), 1e-300))
+def _drawn(stated: np.ndarray, measured: np.ndarray) -> float:
+    """By what to multiply squared errors that are stated, for their sum to be nearer to the measured one.
+
+    The more squares make up that sum, the nearer.
+    """
+    number = number_of(measured)
+    ratio = measured.sum(dtype=np.float64) / max(stated.sum(dtype=np.float64), 1e-300)
+    return float(max(ratio, LEAST_RATIO) ** (number / (number + STATED)))
+
+
+def _factor(
+    deviation: np.ndarray,
+    variance: np.ndarray | None,
+    have: np.ndarray,
+    room: float,
+    allowed: float,
+    gain: float = 0.0,
+) -> float:
+    """By what to multiply deviations for rays that leave a mean variance that is allowed; or, if that is
+    less, for those that there is room for.
+
+    Pixels keep the rays they have. ``variance``: of a ray; None: nothing is allowed. It falls by a power of
+    the rays that is greater than 1 by the ``gain``. Found without rounding, in every so many pixels.
+    """
+    step = max(1, deviation.size // RANKED)
+    every = deviation.ravel()[::step]
+    there = have.ravel()[::step]
+    low = 0.0
+    high = (room + have.sum()) / deviation.sum()
+    for _ in range(24):
+        factor = (low + high) / 2
+        rays = np.maximum(factor * every, there)
+        enough = step * float((rays - there).sum()) > room
+        if variance is not None and not enough:
+            left = variance.ravel()[::step] / rays
+            left = left * (there / rays) ** gain if gain else left
+            enough = float(left.mean()) <= allowed
+        low, high = (low, factor) if enough else (factor, high)
+    return high

@@ -17,7 +17,7 @@ from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.film import Region
-from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Means, Stack
+from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Means, Stack, widened
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
 from mrt_mitsuba.rendering.settings import DETECTORS, FILM
@@ -104,7 +104,7 @@ class Passes:
         seed = self._seed
         marked = np.zeros((plan.height, plan.width), bool)
         if stack is None:
-            stack = Stack(film, 1, len(exposer.names))
+            stack = Stack.blank(film, 1, len(exposer.names))
             whole = Region(0, 0, plan.width, plan.height)
             marked[plan.seen.grown(film.reach, plan.width, plan.height).inside(whole)] = True
             pixels = np.flatnonzero(np.pad(marked, film.border, constant_values=True))
@@ -112,13 +112,13 @@ class Passes:
         else:
             marked[self._seen] = self.layers["samples"][..., 0] > 1
             chosen = np.pad(marked, film.border).reshape(1, -1)
-            pixels = np.flatnonzero(stack.widened(chosen)[0])
+            pixels = np.flatnonzero(widened(film, chosen)[0])
             seed += 1
         starts = exposer.starts(step.places, seed)
         moments = "square" in step.layers
         with self._job.stage(step.name, len(pixels) * rays) as advance:
             exposed = exposer.expose(Groups(rays, pixels), starts, moments=moments, advance=advance)
-            stack.add(exposed, chosen)
+            stack = stack.plus(exposed, chosen)
         if moments:
             square = exposed.square[:, 0] / rays - (exposed.total[:, 0] / rays) ** 2
             variance = np.maximum(square, 0) / (rays - 1) * film.averaging
@@ -139,23 +139,26 @@ class Passes:
 
     def _run_rounds(self, step: Rounds) -> None:
         """Expose pixels until the noise is as low as was asked for."""
-        from mrt_mitsuba.rendering.noise import Halves
+        from mrt_mitsuba.rendering.noise import Noise, RayNoise
         from mrt_mitsuba.rendering.rounds import run_rounds
-        from mrt_mitsuba.rendering.whole import Wholes
+        from mrt_mitsuba.rendering.whole import PictureNoise
 
         # glibc keeps freed blocks up to the size of the largest that was freed, in place of clearing fresh
         # pages (mallopt(3), M_MMAP_THRESHOLD); this one is never written to, and takes no memory
         np.empty(2**25 - 2**16, np.uint8)
         exposer = Exposer(self._job, self._shader, self._shader.film, step.layers)
-        halves = Wholes if self._plan.whole else Halves
-        picture = halves(exposer, self._seed, self._blurred if self._plan.blur else None)
-        self.rounds, self.error = run_rounds(picture, self._job.stage, step.goal, self._job.on_round)
-        self._develop(exposer, picture.mean())
-        variance = picture.variance()[self._seen]
+        blurred = self._blurred if self._plan.blur else None
+        kind = PictureNoise if self._plan.whole else RayNoise
+        noise: Noise = kind(exposer, self._seed, blurred)
+        finished = run_rounds(noise, self._job.stage, step.goal, self._job.on_round)
+        self.rounds = finished.rounds
+        self.error = finished.error
+        self._develop(exposer, finished.state.image())
+        variance = noise.variance(finished.state)[self._seen]
         with np.errstate(over="ignore"):  # of errors beyond float32
             self._layer("variance")[:] = variance
         self._layer("error")[:] = np.sqrt(variance.mean(-1, keepdims=True))
-        self._layer("samples")[..., 0] = picture.samples()[self._seen]
+        self._layer("samples")[..., 0] = finished.state.samples()[self._seen]
 
     def _develop(self, exposer: Exposer, picture: np.ndarray) -> None:
         """Turn what is exposed, [H, W, channels], into layers."""

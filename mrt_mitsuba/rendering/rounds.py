@@ -9,17 +9,18 @@ import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from mrt_mitsuba.errors import MrtWarning
 from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, Round, RoundPicture
+from mrt_mitsuba.rendering.noise import SUSPECT, estimate
 from mrt_mitsuba.rendering.progress import Advance
 from mrt_mitsuba.target import Goal
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.rendering.noise import Forecast, Halves
+    from mrt_mitsuba.rendering.noise import Forecast, Noise, State
 
 log = logging.getLogger(__name__)
 
@@ -28,17 +29,33 @@ LEAST = 2**18  # rays that a target takes at least: fewer do not show what is ra
 LEAST_EVEN = 2**17  # where noise is even: fewer may miss what is rare in a small picture
 MORE = 2  # times the rays are doubled where the tail of their values is in doubt
 EVEN = 0.25  # of the mean deviation is the least that a pixel is given rays for, until there are as many
+SHY = 0.85  # of the rays that a target seems to want, until there are as many
 NEAR = 1.05  # times a target is an error that reaches it, as far as it is known
+CONFIRMED = 1.15  # times the rays there are may be missing, where rare rays may rule
 LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
 OnRound = Callable[[RoundPicture], object]
 Stage = Callable[[str, int, str], AbstractContextManager[Advance]]
 
 
-def run_rounds(
-    picture: Halves, stage: Stage, goal: Goal, on_round: OnRound | None = None
-) -> tuple[list[Round], ErrorEstimate]:
-    """Trace rounds until a goal is reached; return what each has found, and the error in the end.
+class Finished(NamedTuple):
+    """What rounds came to."""
+
+    rounds: list[Round]
+    state: State
+    error: ErrorEstimate
+
+
+class Next(NamedTuple):
+    """What a further round traces."""
+
+    chosen: np.ndarray  #: numbers of groups, see ``Noise``
+    last: bool  #: halves have decided for each other, and so no other round may follow
+    doubled: int = 0  #: times that rays were doubled in doubt
+
+
+def run_rounds(noise: Noise, stage: Stage, goal: Goal, on_round: OnRound | None = None) -> Finished:
+    """Trace rounds until a goal is reached.
 
     Warns of a target that is not reached, and of an error that cannot be trusted. ``on_round`` is called
     after each round, and stops by returning False.
@@ -46,67 +63,89 @@ def run_rounds(
     start = time.perf_counter()
     done = list[Round]()
     spent = 0
-    pixels = picture.film.pixels
-    rays = goal.most
-    seconds = goal.seconds
-    asked = goal.target
+    pixels = noise.film.pixels
     target: float | None = None
-    doubled = 0
-    chosen = picture.first()
     stopped = False
-    while cost := picture.cost(chosen):
+    state = noise.blank()
+    following = Next(noise.begin, last=False)
+    while cost := noise.cost(following.chosen):
         spent += cost
         with stage("rounds", cost, _message(done, target, cost / pixels)) as advance:
-            picture.trace(chosen, advance)
-        rmse = math.sqrt(float(picture.squares().mean()))
+            state = noise.trace(state, following.chosen, advance)
+        rmse = math.sqrt(float(state.squares(noise.blurred).mean()))
         now = Round(time.perf_counter() - start, spent / pixels, rmse)
         done.append(now)
-        if asked and target is None:
-            target = asked.rmse(picture.luminance())
+        if goal.target and target is None:
+            target = goal.target.rmse(state.luminance())
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
-        stopped = on_round is not None and on_round(_shown(now, picture, target)) is False
-        if stopped or target == 0:
+        stopped = on_round is not None and on_round(_shown(now, noise, state, target)) is False
+        if stopped or target == 0 or following.last:
             break
-        most = min(rays, GROWTH * now.spp)
-        if seconds is not None:
-            most = min(most, now.spp * seconds / now.seconds)
-        if picture.last or most < LEAST_GROWTH * now.spp:
+        most = min(goal.most, GROWTH * now.spp)
+        if goal.seconds is not None:
+            most = min(most, now.spp * goal.seconds / now.seconds)
+        if most < LEAST_GROWTH * now.spp:
             break
-        # not asked for where all rays that are left are spent at once, whatever it says
-        forecast = picture.forecast() if target or most < rays else None
-        aim = target and picture.margin * max(target, 1e-100)
-        least = _least(picture, forecast, rays) if forecast and target else 0
-        if now.spp < 0.9 * least:  # shares are rounded
-            chosen = picture.next(forecast, min(most, least), rays, even=EVEN)
-        elif forecast is None or target is None or forecast.rmse > target:
-            chosen = picture.next(forecast, most, rays, aim)
-        elif forecast.tail > DOUBTFUL and doubled < MORE:
-            chosen = picture.next(forecast, min(most, 2 * now.spp), rays)
-            doubled += 1
-        else:  # the halves know better what is missing, if anything
-            chosen = picture.next(None, most, most, aim)
-    error = replace(picture.error(), target=target)
-    found = [picture.unfit(), _doubt(error), "" if stopped else _missed(goal, now, error)]
+        following = _next(noise, state, now.spp, most, goal.most, target, following.doubled)
+    error = replace(estimate(noise, state), target=target)
+    found = [state.unfit_rays(), _doubt(error), "" if stopped else _missed(goal, now, error)]
     if any(found):
         warnings.warn("; ".join(filter(None, found)), MrtWarning, stacklevel=7)  # the caller of render
-    return done, error
+    return Finished(done, state, error)
 
 
-def _least(picture: Halves, forecast: Forecast, rays: float) -> float:
+def _next(
+    noise: Noise, state: State, spp: float, most: float, rays: float, target: float | None, doubled: int
+) -> Next:
+    """What to trace after ``spp`` rays a pixel, of which there may be ``most`` after the next round, and
+    ``rays`` in the end."""
+    if target is None and most >= rays:
+        return Next(noise.last_shares(state, rays, None), last=True)
+    forecast = noise.forecast(state)
+    aim = None if target is None else noise.margin * max(target, 1e-100)
+    wanted = rays if aim is None else noise.wanted(state, forecast, aim)
+    least = 0.0 if aim is None else _least(noise, forecast, rays)
+    even = 0.0
+    if spp < 0.9 * least:  # shares are rounded
+        most = min(most, max(least, SHY * wanted))
+        aim = None
+        even = EVEN
+    elif target is not None and forecast.rmse <= target:
+        if (
+            forecast.tail <= DOUBTFUL or doubled == MORE
+        ):  # the halves know better what is missing, if anything
+            return Next(noise.last_shares(state, most, aim), last=True)
+        doubled += 1
+        most = min(most, 2 * spp)
+        aim = None
+    elif wanted <= most:
+        if forecast.tail < SUSPECT or wanted < CONFIRMED * spp:
+            return Next(noise.last_shares(state, rays, aim), last=True)
+        most = wanted  # where rare rays may rule, scouts have to confirm it
+    if most >= rays:
+        return Next(noise.last_shares(state, rays, aim), last=True)
+    return Next(noise.shares(state, forecast, most, even), last=False, doubled=doubled)
+
+
+def _least(noise: Noise, forecast: Forecast, rays: float) -> float:
     """The mean rays of a pixel that a target takes at least."""
     least = LEAST_EVEN if forecast.even else LEAST
-    return min(rays, picture.least, least / picture.film.pixels)
+    return min(rays, noise.least, least / noise.film.pixels)
 
 
-def _shown(now: Round, picture: Halves, target: float | None) -> RoundPicture:
+def _shown(now: Round, noise: Noise, state: State, target: float | None) -> RoundPicture:
     """A round with copies of its picture, its error and its rays."""
+    image = state.image()[..., :3]
+    if noise.blurred is not None:
+        image = noise.blurred(image)
+    deviation = np.sqrt(noise.variance(state).mean(-1))
     with np.errstate(over="ignore"):  # of errors beyond float32
-        image, deviation, samples = (np.array(values, np.float32) for values in picture.maps())
-    return RoundPicture(now.seconds, now.spp, now.rmse, image, deviation, samples, target)
+        copies = (np.array(values, np.float32) for values in (image, deviation, state.samples()))
+        return RoundPicture(now.seconds, now.spp, now.rmse, *copies, target)
 
 
 def _doubt(error: ErrorEstimate) -> str:
-    """Return what makes an error one not to be trusted; nothing if nothing does."""
+    """What makes an error one not to be trusted; nothing if nothing does."""
     if error.tail <= DOUBTFUL:
         return ""
     return (
@@ -117,7 +156,7 @@ def _doubt(error: ErrorEstimate) -> str:
 
 
 def _missed(goal: Goal, now: Round, error: ErrorEstimate) -> str:
-    """Return why an error is larger than was asked for; nothing if it is not."""
+    """Why an error is larger than was asked for; nothing if it is not."""
     target, rays, seconds = error.target, goal.most, goal.seconds
     if target == 0:
         return (
@@ -141,7 +180,7 @@ def _missed(goal: Goal, now: Round, error: ErrorEstimate) -> str:
 
 
 def _message(done: list[Round], target: float | None, more: float) -> str:
-    """Return where a render stands before a round of so many rays a pixel."""
+    """Where a render stands before a round of so many rays a pixel."""
     if not done:
         return ""
     now = done[-1]

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.filters.grid import window_means
 from mrt_mitsuba.output.error import tail_shape
+from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.exposing import Exposer
-from mrt_mitsuba.rendering.noise import HALVES, LUMINANCE, SCOUTS, Halves, quarter_squares
+from mrt_mitsuba.rendering.noise import (
+    HALVES,
+    LUMINANCE,
+    MARGIN,
+    SCOUTS,
+    Blurred,
+    Forecast,
+    State,
+    number_of,
+    quarter_squares,
+)
+from mrt_mitsuba.rendering.progress import Advance
 
 _STRIDE = 0x9E3779B9  # from one seed to the next: the golden ratio in 32 bits
 
 
 def whole_pictures(
-    exposer: Exposer, seed: int, rays: int, advance: Callable[[int], object]
+    exposer: Exposer, seed: int, rays: int, advance: Advance
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield pictures [H, W, channels], which have so many rays a pixel in all and fit into memory, with the
-    rays of each."""
+    """Pictures [H, W, channels], which have so many rays a pixel in all and fit into memory, with the rays of
+    each."""
     job, film, shader = exposer.job, exposer.film, exposer.shader
     if film.bands:
         raise UsageError(
@@ -46,52 +60,93 @@ def whole_pictures(
         job.rays["primary"] += count * film.pixels
 
 
-class Wholes(Halves):
-    """Two half pictures and two scouts, in which all pixels get the same rays.
+class PictureNoise:
+    """The noise of whole pictures, in which all pixels get the same rays. See ``Noise``.
 
     A picture has no single rays, so halves and scouts are compared as they are; what rules rays by their tail
     rules sums of them, too.
     """
 
-    group = 1
-    fields = 1
-    begin = (2, 2, 1, 1)
-    scouting = (1 / 8, 1 / 8)
-    least = 64
+    margin = MARGIN
+    least = 64.0
+    scouting = 1 / 8  #: rays of scouts over those of halves
 
-    def trace(self, chosen: np.ndarray, advance: Callable[[int], object]) -> None:
-        """Render pictures."""
+    def __init__(self, exposer: Exposer, seed: int, blurred: Blurred | None = None) -> None:
+        self.film: Film = exposer.film
+        self.blurred = blurred
+        self._exposer = exposer
+        self._seed = seed
+        self.begin = self._everywhere(2, 1)
+
+    def _everywhere(self, half: int, scout: int) -> np.ndarray:
+        """Rays of each half and each scout, [4, pixels]."""
+        return np.repeat([[half], [half], [scout], [scout]], self.film.pixels, 1)
+
+    def blank(self) -> State:
+        return State.blank(self.film, len(self._exposer.names))
+
+    def cost(self, chosen: np.ndarray) -> int:
+        return int(chosen.sum())
+
+    def trace(self, state: State, chosen: np.ndarray, advance: Advance) -> State:
         border = [(self.film.border,) * 2] * 2
-        for picture, rays in enumerate(chosen[:, 0]):
-            for count, found in whole_pictures(self._exposer, self._seed, int(rays), advance):
-                values = np.pad(count * found, [*border, (0, 0)])
-                self._seed = (self._seed + _STRIDE) % 2**32
-                self._traced[picture] += count
-                self._total[:, picture] += np.moveaxis(values[..., :3], -1, 0)
+        rays = state.rays.copy()
+        total = state.total.copy()
+        sums = state.halves.sums.copy()
+        for picture, number in enumerate(chosen[:, 0]):
+            seed = (self._seed + _STRIDE * (4 * state.exposures + picture)) % 2**32
+            for count, found in whole_pictures(self._exposer, seed, int(number), advance):
+                values = np.moveaxis(np.pad(count * found, [*border, (0, 0)]), -1, 0)
+                rays[picture] += count
+                total[:, picture] += values[:3]
                 if picture in HALVES:
-                    self.sums[:, picture] += np.moveaxis(values, -1, 0)
-                    self.weights[picture] += count
-                    self.amount[picture] += count
-                    self.rays[picture] += count
-        self._bad = np.asarray(~np.isfinite(self._total).all((0, 1)))
-        self._unfit = self._total[..., self._bad].max(initial=-np.inf)
+                    sums[:, picture] += values
+        weights = rays[HALVES].astype(np.float32)
+        bad = np.asarray(~np.isfinite(total).all((0, 1)))
+        return replace(
+            state,
+            rays=rays,
+            total=total,
+            halves=replace(state.halves, sums=sums, weights=weights, amount=weights),
+            bad=bad,
+            unfit=float(total[:, :, bad].max(initial=-np.inf)),
+            exposures=state.exposures + 1,
+        )
 
-    def variance(self) -> np.ndarray:
-        squares = window_means(np.moveaxis(self._squares(HALVES), -1, 0), 4)
-        return np.moveaxis(squares, 0, -1)
-
-    def _decisive(self, *_: object) -> np.ndarray:
-        """Return the variance of a pixel times its rays as the scouts have it, alike in all pixels."""
-        return np.full(self.film.shape, self._squares(SCOUTS).mean() * self._traced[SCOUTS].sum(0)[0])
-
-    def _due(self, rays: np.ndarray, have: np.ndarray, _: np.ndarray) -> np.ndarray:
-        return np.asarray(np.maximum(np.ceil(rays) - have, 0), np.int64)
-
-    def _tail(self, which: list[int]) -> float:
-        values = np.sqrt(self._squares(which).mean(-1)).ravel()
+    def tail(self, state: State, pictures: Sequence[int]) -> float:
+        values = np.sqrt(self._squares(state, pictures).mean(-1)).ravel()
         return tail_shape(values, np.ones(len(values)))
 
-    def _squares(self, which: list[int]) -> np.ndarray:
-        """Return a quarter of the squared difference of two pictures, [H, W, 3], without the border."""
-        first, second = np.moveaxis(self._total / self.rows(self._traced), 0, -1)[which]
-        return self.film.picture(np.where(self._bad[..., None], 0, quarter_squares(first, second)))
+    def forecast(self, state: State) -> Forecast:
+        squares = self._squares(state, SCOUTS)
+        scouts, halves = (float(state.rays[which].sum(0)[0, 0]) for which in (SCOUTS, HALVES))
+        variance = np.full(self.film.shape, float(squares.mean()) * scouts)
+        noisy = number_of(squares.mean(-1)) / self.film.pixels
+        return Forecast(math.sqrt(variance[0, 0] / halves), self.tail(state, SCOUTS), noisy, variance)
+
+    def wanted(self, state: State, forecast: Forecast, target: float) -> float:
+        halves = max(forecast.variance[0, 0] / target**2, state.rays[HALVES].sum(0)[0, 0])
+        return float(halves + state.rays[SCOUTS].sum(0)[0, 0])
+
+    def shares(self, state: State, forecast: Forecast, most: float, even: float) -> np.ndarray:
+        half = math.floor(most / 2 / (1 + self.scouting))
+        have = state.rays[:, 0, 0].astype(np.int64)
+        scout = math.ceil(self.scouting * half)
+        return self._everywhere(max(half - have[0], 0), max(scout - have[2], 0))
+
+    def last_shares(self, state: State, most: float, target: float | None) -> np.ndarray:
+        have = state.rays[:, 0, 0].astype(np.int64)
+        half = (most - have[2] - have[3]) / 2
+        if target is not None:
+            wanted = self.forecast(state).variance[0, 0] / (2 * target**2)
+            half = min(half, math.ceil(wanted))
+        return self._everywhere(max(math.floor(half) - have[0], 0), 0)
+
+    def variance(self, state: State) -> np.ndarray:
+        squares = window_means(np.moveaxis(self._squares(state, HALVES), -1, 0), 4)
+        return np.moveaxis(squares, 0, -1)
+
+    def _squares(self, state: State, pictures: Sequence[int]) -> np.ndarray:
+        """A quarter of the squared difference of two pictures, [H, W, 3], without the border."""
+        first, second = np.moveaxis(state.total / state.rays, 0, -1)[list(pictures)]
+        return self.film.picture(np.where(state.bad[..., None], 0, quarter_squares(first, second)))

@@ -15,7 +15,7 @@ from numpy.testing import assert_array_equal
 import mrt_mitsuba as mrt
 from mrt_mitsuba.output.error import DOUBTFUL, tail_shape
 from mrt_mitsuba.rays.film import Film
-from mrt_mitsuba.rendering.noise import Halves
+from mrt_mitsuba.rendering.noise import RayNoise
 from mrt_mitsuba.rendering.rounds import run_rounds
 from mrt_mitsuba.target import Goal, Target
 
@@ -38,12 +38,11 @@ class Draws:
         self.draws = [draw_other or draw if picture == other else draw for picture in range(4)]
 
     def expose(self, groups: Any, starts: Any, *, pictures: int, **_: Any) -> Any:
-        seed = starts.sampling.seed
+        seed = starts.seed
         shape = (pictures, SIDE, SIDE)
-        rays = np.zeros((pictures, PIXELS), np.int64)
-        np.add.at(rays.ravel(), groups.pixels, groups.size)
+        rays = groups.rays_of(pictures * PIXELS).reshape(pictures, PIXELS)
         before = np.zeros((pictures, PIXELS), np.int64)
-        before.ravel()[groups.pixels[::-1]] = groups.first[::-1]
+        before.ravel()[groups.pixels] = groups.first
         total, square, peak = np.zeros((3, pictures, PIXELS))
         for picture, draw in enumerate(self.draws):
             rng = np.random.default_rng((seed, picture, int(before[picture].sum())))
@@ -61,12 +60,16 @@ class Draws:
 
 def _render(exposer: Draws, seed: int = 0, target: Any = None, rays: int = 64, on_round: Any = None) -> Any:
     """Return what a render of drawn values has."""
-    halves = Halves(exposer, seed)  # type: ignore[arg-type]
+    noise = RayNoise(exposer, seed)  # type: ignore[arg-type]
     aim = Goal(None if target is None else Target.of(target), rays)
-    rounds, error = run_rounds(halves, lambda *_: nullcontext(lambda rays: None), aim, on_round)
-    image, error_map, samples = halves.maps()
+    rounds, state, error = run_rounds(noise, lambda *_: nullcontext(lambda rays: None), aim, on_round)
     return SimpleNamespace(
-        rounds=rounds, error=error, rays=halves.rays, image=image, map=error_map, samples=samples
+        rounds=rounds,
+        error=error,
+        rays=state.rays.reshape(4, PIXELS)[:2],
+        image=state.image(),
+        map=np.sqrt(noise.variance(state).mean(-1)),
+        samples=state.samples(),
     )
 
 
