@@ -34,7 +34,8 @@ Values = dict[str, list[Any]]
 OWN = "own:"  # begins what is no layer's name: the channels of the film and the integrator
 
 
-class Groups(NamedTuple):
+@dataclass(frozen=True)
+class Groups:
     """Groups of ``size`` rays, each in one entry of a list of pixels."""
 
     size: int

@@ -140,8 +140,15 @@ def _shown(now: Round, noise: Noise, state: State, target: float | None) -> Roun
         image = noise.blurred(image)
     deviation = np.sqrt(noise.variance(state).mean(-1))
     with np.errstate(over="ignore"):  # of errors beyond float32
-        copies = (np.array(values, np.float32) for values in (image, deviation, state.samples()))
-        return RoundPicture(now.seconds, now.spp, now.rmse, *copies, target)
+        return RoundPicture(
+            seconds=now.seconds,
+            spp=now.spp,
+            rmse=now.rmse,
+            image=np.array(image, np.float32),
+            error=deviation.astype(np.float32),
+            samples=np.array(state.samples(), np.float32),
+            target=target,
+        )
 
 
 def _doubt(error: ErrorEstimate) -> str:
