@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -24,7 +24,9 @@ from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY
 from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.rays.canvas import Canvas
 from mrt_mitsuba.rays.film import Film, Places, divide, opaque
+from mrt_mitsuba.rendering.plan import Pass
 from mrt_mitsuba.rendering.progress import Advance, Job
+from mrt_mitsuba.rendering.settings import FILM
 from mrt_mitsuba.rendering.shading import RayValues, Shader
 
 log = logging.getLogger(__name__)
@@ -309,12 +311,13 @@ class Exposer:
     film, R, G and B first, and of its integrator. ``names``: of all channels, the own ones first.
     """
 
-    def __init__(self, job: Job, shader: Shader, film: Film | None, layers: Set[str]) -> None:
+    def __init__(self, job: Job, shader: Shader, step: Pass) -> None:
+        film = shader.film if step.places.lattice == FILM else None
         self.job = job
         self.shader = shader
         self.film: Any = film  #: None for a lattice
         known = ("image", "square") if film else ()  # to a film by itself
-        self.layers = [name for name in TABLE if name in layers and name not in known]
+        self.layers = [name for name in TABLE if name in step.layers and name not in known]
         self.own = [*"RGB", *"A" * film.alpha, *film.bands, *shader.aovs] if film else []
         ours = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
         self.names = self.own + ours

@@ -20,7 +20,7 @@ from mrt_mitsuba.rays.film import Region
 from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Means, Stack, widened
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
-from mrt_mitsuba.rendering.settings import DETECTORS, FILM
+from mrt_mitsuba.rendering.settings import DETECTORS
 from mrt_mitsuba.rendering.shading import Shader
 
 if TYPE_CHECKING:
@@ -58,26 +58,27 @@ class Passes:
                         self._detect(step.detector, advance)
                     else:
                         self._blur(self.layers["image"], step, advance, "blur" in self._plan.layers)
-            elif isinstance(step, Rounds):
-                self._run_rounds(step)
-            elif step.places.lattice != FILM:
-                self._trace(step)
+                continue
+            exposer = Exposer(self._job, self._shader, step)
+            if isinstance(step, Rounds):
+                self._run_rounds(step, exposer)
+            elif exposer.film is None:
+                self._trace(step, exposer)
             elif self._plan.whole:
-                self._expose_whole(step)
+                self._expose_whole(step, exposer)
             else:
-                stack = self._expose(step, stack)
+                stack = self._expose(step, exposer, stack)
         if "samples" in self._plan.layers and "samples" not in self.layers:
             self._layer("samples")[:] = self._plan.samples
         return self.layers
 
     # ------------------------------------------ Rays of a pass --------------------------------------
 
-    def _trace(self, step: Pass) -> None:
+    def _trace(self, step: Pass, exposer: Exposer) -> None:
         """Trace samples of a lattice: their means are new layers or, at edges, are averaged with these."""
         places = replace(step.places, seed=self._seed)
         if self._phase is not None:
             places = replace(places, phase=self._phase)
-        exposer = Exposer(self._job, self._shader, None, step.layers)
         pixels = self._pixels
         edge = None
         seed = self._seed
@@ -93,13 +94,13 @@ class Passes:
         with self._job.stage(step.name, len(pixels)) as advance:
             exposer.average(Groups(places.size, pixels), exposer.starts(places, seed), means, advance)
         if "square" in step.layers:
-            variance = np.maximum(self.layers["square"] - self.layers["image"] ** 2, 0)
-            self.layers["square"] = variance / (places.size - 1)  # of the means
+            variance = np.maximum(self.layers.pop("square") - self.layers["image"] ** 2, 0)
+            self.layers["variance"] = variance / (places.size - 1)  # of the means
 
-    def _expose(self, step: Pass, stack: Stack | None) -> Stack:
+    def _expose(self, step: Pass, exposer: Exposer, stack: Stack | None) -> Stack:
         """Expose the pixels of a film that reach what is seen or, on top of a ``stack``, those at edges."""
-        film, plan = self._shader.film, self._plan
-        exposer = Exposer(self._job, self._shader, film, step.layers)
+        film = exposer.film
+        plan = self._plan
         rays = film.rays_near(step.places.size)
         seed = self._seed
         marked = np.zeros((plan.height, plan.width), bool)
@@ -122,22 +123,21 @@ class Passes:
         if moments:
             square = exposed.square[:, 0] / rays - (exposed.total[:, 0] / rays) ** 2
             variance = np.maximum(square, 0) / (rays - 1) * film.averaging
-            self._layer("square")[:] = film.picture(np.moveaxis(variance, 0, -1))[self._seen]
+            self._layer("variance")[:] = film.picture(np.moveaxis(variance, 0, -1))[self._seen]
         self._develop(exposer, stack.mean())
         return stack
 
-    def _expose_whole(self, step: Pass) -> None:
+    def _expose_whole(self, step: Pass, exposer: Exposer) -> None:
         """Let an integrator that follows no camera rays expose the film."""
         from mrt_mitsuba.rendering.whole import whole_pictures
 
-        film = self._shader.film
-        exposer = Exposer(self._job, self._shader, film, step.layers)
+        film = exposer.film
         rays = film.rays_near(step.places.size)
         with self._job.stage(step.name, rays * film.pixels) as advance:
             counts, pictures = zip(*whole_pictures(exposer, self._seed, rays, advance), strict=True)
         self._develop(exposer, np.average(pictures, axis=0, weights=counts))
 
-    def _run_rounds(self, step: Rounds) -> None:
+    def _run_rounds(self, step: Rounds, exposer: Exposer) -> None:
         """Expose pixels until the noise is as low as was asked for."""
         from mrt_mitsuba.rendering.noise import Noise, RayNoise
         from mrt_mitsuba.rendering.rounds import run_rounds
@@ -146,7 +146,6 @@ class Passes:
         # glibc keeps freed blocks up to the size of the largest that was freed, in place of clearing fresh
         # pages (mallopt(3), M_MMAP_THRESHOLD); this one is never written to, and takes no memory
         np.empty(2**25 - 2**16, np.uint8)
-        exposer = Exposer(self._job, self._shader, self._shader.film, step.layers)
         blurred = self._blurred if self._plan.blur else None
         kind = PictureNoise if self._plan.whole else RayNoise
         noise: Noise = kind(exposer, self._seed, blurred)
@@ -179,7 +178,7 @@ class Passes:
         """Look for edges, and note how many samples each pixel is due."""
         strength = self._layer("edges")[..., 0]
         samples = self._layer("samples")[..., 0]
-        variance = self.layers.pop("square", None)
+        variance = self.layers.pop("variance", None)
         detect = getattr(filters, f"{mode}_edges")
         for rows, seen, inner in self._bands(edges.REACH):
             read = [self.layers[name][seen] for name in DETECTORS[mode]]

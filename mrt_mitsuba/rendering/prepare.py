@@ -17,7 +17,7 @@ from mrt_mitsuba.plugins.snapshot import Part
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
 from mrt_mitsuba.rendering.exposing import Exposer
-from mrt_mitsuba.rendering.settings import FILM, RenderSettings
+from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import opened
 
@@ -127,9 +127,7 @@ class Prepared:
             return
         self._state = None
         self._state = self._look()
-        self._exposer = Exposer(
-            self._job, shader, shader.film if first.places.lattice == FILM else None, {"image"}
-        )
+        self._exposer = Exposer(self._job, shader, first)
         self._made = replace(made, camera=camera_matrices(view))
         # By a weak reference: in a ring, garbage collection would free recordings in the midst of another one
         me: Any = weakref.ref(self)
