@@ -77,7 +77,7 @@ def without_mask(size, ctx):
 @finds("masked", "lobes brighter where they are asked for by type", 1e-4, eval=by_mask)
 @finds("masked_samples", "types of lobes ignored", 1, context=without_mask)
 def components(law: Law, case: Case) -> None:
-    """Flags of components say what they do; f = Σ fᵢ; ``component`` and ``type_mask`` of ``ctx`` select."""
+    """A component does what its flags say; f = Σ fᵢ; ``component`` and ``type_mask`` of ``ctx`` select."""
     bsdf = case.plugin
     p = case.pairs
     flags = [int(bsdf.flags(i)) for i in range(bsdf.component_count())]
@@ -172,7 +172,7 @@ def by_variant(size, value, *_):
 )
 @finds("same", "values larger in scalar variants", 3e-3, value=by_variant)
 def variants(law: Law, case: Case) -> None:
-    """Values in the scalar variant, and in the spectral one where colours are grey."""
+    """Values are the same in the scalar variant, and in the spectral one where colours are grey."""
     here = mi.variant()
     case.with_()
     few = case.pairs.only(np.isfinite(case.pairs.value).all(axis=1)).only(slice(0, case.count(200, 800)))
@@ -205,7 +205,7 @@ def variants(law: Law, case: Case) -> None:
     )
 )
 def switch(law: Law, case: Case) -> None:
-    """Values after a switch to another variant and back, of the BSDF as it was and loaded anew."""
+    """Values are the same after a switch to another variant and back, loaded before it or anew."""
     here = mi.variant()
     few = case.pairs.only(slice(0, case.count(1000, 1000)))
     other = next(v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here)

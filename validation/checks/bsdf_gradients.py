@@ -97,7 +97,7 @@ def steeper(size, value, *_):
 @finds("values", "derivative of values too large", 0.03, nested=GLOSS, value=steeper)
 @finds("weights", "derivative of weights too large", 0.03, nested=GLOSS, sample=of_weight(steeper))
 def gradients(law: Law, case: Case) -> None:
-    """∂/∂π of the mean value, by forward derivatives, against differences, for every parameter π."""
+    """Derivatives by every parameter agree with differences, and those of samples with those of values."""
     if "_ad_" not in mi.variant():
         raise Skip(f"{mi.variant()} has no derivatives")
     case.need_smooth()

@@ -107,7 +107,7 @@ def stairs_of(size, u):
 @finds("still", "directions in stairs, in random numbers", 1e-5, u=stairs_of)
 @finds("integral", "density too large everywhere", 0.01, pdf=larger)
 def sampling(law: Law, case: Case) -> None:
-    """Samples against the density: ∫ pdf dω over a cell is the share of samples in it (Pearson's χ²).
+    """Samples follow the density: the share of samples in a cell is ∫ pdf dω over it (Pearson's χ²).
 
     In whole cells of equal counts over both hemispheres; in a full check also in small ones and in narrow
     slices, for faults in one place at any incidence.
@@ -207,7 +207,7 @@ def weight_in_stairs(size, weight, u):
     sample=of_sample(member("pdf", smaller)),
 )
 def weights(law: Law, case: Case) -> None:
-    """Density and weight of a sample are ``pdf`` and ``eval`` / ``pdf`` of its direction.
+    """The density and weight of a sample are ``pdf`` and ``eval`` / ``pdf`` of its direction.
 
     Of lobes of one direction, the density is the probability with which they are drawn.
     """

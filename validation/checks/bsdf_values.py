@@ -62,7 +62,7 @@ def density_of_pair(size, pair, *_):
 @finds("value", "value of eval_pdf() too large in one channel", 1e-4, pair=first_channel)
 @finds("density", "density of eval_pdf() too large", 2e-4, nested=GLOSS, pair=density_of_pair)
 def eval_pdf(law: Law, case: Case) -> None:
-    """``eval_pdf`` is ``eval`` and ``pdf``; both ways to a value are 0 where ``active`` is False.
+    """``eval_pdf`` returns what ``eval`` and ``pdf`` do; values are 0 where ``active`` is False.
 
     Densities need not be: half of Mitsuba's plugins state one in any lane.
     """
@@ -142,7 +142,7 @@ def by_mode(size, value, ctx, *_):
 @finds("single", "more light through glass from one side", 3e-3, nested=GLASS, value=from_one_side)
 @finds("single_modes", "more light through glass by importance", 3e-3, nested=GLASS, value=by_mode)
 def reciprocity(law: Law, case: Case) -> None:
-    """f(ωi, ωo) η_o² = f(ωo, ωi) η_i², with the indices of the media that the directions are in.
+    """f(ωi, ωo) η_o² = f(ωo, ωi) η_i², with the indices of refraction on either side.
 
     E. Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, § 5.2.
     """
@@ -243,7 +243,7 @@ def negative_next_to_normal(size, value, ctx, wi, wo):
 @finds("million", "direction NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=no_direction)
 @finds("values", "negative value where both cosines are so near to 1", 1e-6, value=negative_next_to_normal)
 def finite(law: Law, case: Case) -> None:
-    """No NaN, no infinity, nothing negative: extreme directions, random numbers and parameters."""
+    """No NaN, infinity or negative number, for extreme directions, random numbers and parameters."""
     extremes = _extremes(case)
     sound = _finite(law, case, extremes)
     judge_many(law, case, partial(_at_random, case))
@@ -349,7 +349,7 @@ def stairs_on_slope(size, value, ctx, wi, wo):
 )
 @finds("lost", "stairs on a slope, of this height", 3e-4, value=stairs_on_slope)
 def roundoff(law: Law, case: Case) -> None:
-    """Noise of float32 evaluation beyond what the rounding of the directions explains (``noise``)."""
+    """Float32 evaluation loses no more digits than the rounding of directions explains (``noise``)."""
     case.need_smooth()
     p = case.pairs
     steep = (abs(p.wi[:, 2]) > 0.1) & (abs(p.wo[:, 2]) > 0.1)

@@ -247,7 +247,7 @@ def no_density_of_sample(size, ds, u):
     pdf=no_density_in_hole,
 )
 def sampling(law: Law, case: Case) -> None:
-    """p = o + dist · d; light from all around follows its density (Pearson's χ²)."""
+    """p = o + dist · d; directions to light from all around follow their density (Pearson's χ²)."""
     s = case.samples
     if not s.lit.any():
         raise Skip("no sample carries light")
@@ -267,17 +267,12 @@ def sampling(law: Law, case: Case) -> None:
     tests, _ = chi_square(integrals, codes, len(codes))
     chances = stats.chi2.sf(*tests.T)
     law.hold("counts", sidak(chances.min(), len(chances)))
-    _without_density(law, case)
+    rng = np.random.default_rng((case.seed, 2))
+    anywhere = probe.unit(rng.normal(size=(case.count(2**18, 2**20), 3)))
+    pdf, value = case.seen(anywhere)
+    law.hold("dark", probe.without_density(value, pdf))
     if not probe.is_scalar():
         _in_small_cells(law, case)
-
-
-def _without_density(law: Law, case: Case) -> None:
-    """Light from directions all around has a density."""
-    rng = np.random.default_rng((case.seed, 2))
-    d = probe.unit(rng.normal(size=(case.count(2**18, 2**20), 3)))
-    pdf, value = case.seen(d)
-    law.hold("dark", probe.without_density(value, pdf))
 
 
 def _in_small_cells(law: Law, case: Case) -> None:
@@ -316,7 +311,7 @@ def _directions(case: Case, u: Array) -> Array:
 )
 @finds("weight", "weight of a sample too large", 3e-3, weight=larger)
 def weights(law: Law, case: Case) -> None:
-    """weight · pdf = ``eval_direction`` = what is seen there."""
+    """weight · pdf is ``eval_direction``, the light that is seen there."""
     s = case.samples
     allowed = case.spread[1]
     counts = s.lit & (s.pdf > 0) & np.isfinite(s.weight).all(axis=1)
@@ -339,7 +334,7 @@ def weights(law: Law, case: Case) -> None:
 )
 @finds("million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number)
 def finite(law: Law, case: Case) -> None:
-    """All numbers of samples are finite, directions one unit long, weights and densities not negative."""
+    """Samples are finite, directions have unit length, and weights and densities are not negative."""
     s = case.samples
     sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
     length = abs(norm(np.float64(s.d), axis=1) - 1)

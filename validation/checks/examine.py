@@ -161,7 +161,7 @@ def settings_restored() -> Iterator[None]:
     variant = mi.variant()
     flags = {flag: dr.flag(flag) for flag in dr.JitFlag if flag != dr.JitFlag.Default}
     try:
-        # what is not finite is the law ``finite``'s to deal with
+        # numbers that are not finite are left to the law ``finite``
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             # Mitsuba loads its integrators anew with each variant, and Dr.Jit counts how often
             warnings.filterwarnings("ignore", "The AST-transforming decorator")

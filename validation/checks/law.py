@@ -117,6 +117,13 @@ class Part(Bound):
     figure: str = ""  # its name in the law
     snippet: str = ""
 
+    def used(self) -> float:
+        """The share of its limit that it uses; infinity beyond it."""
+        if not self.holds:
+            return math.inf
+        over, under = sorted((self.measured, self.limit))
+        return over / under if under > 0 else 0.0
+
 
 @dataclass
 class Law:
@@ -169,7 +176,7 @@ class Law:
     @property
     def worst(self) -> Part:
         """The figure that uses most of its limit."""
-        return max(self.parts, key=_used, default=Part("", math.nan, math.nan))
+        return max(self.parts, key=Part.used, default=Part("", math.nan, math.nan))
 
     @property
     def measured(self) -> float:
@@ -211,15 +218,6 @@ class Law:
         if not text:
             text = f"{self.measured:.4g} {self.worst.sign} {self.limit:.4g}, {self.note}"
         return f"{self.verdict:<7} {self.name}: {text}"
-
-
-def _used(part: Part) -> float:
-    """The share of its limit that a figure uses; infinity beyond it."""
-    if not part.holds:
-        return math.inf
-    over = part.measured if part.at_most else part.limit
-    under = part.limit if part.at_most else part.measured
-    return over / under if under > 0 else 0.0
 
 
 def laws_in(*modules: ModuleType) -> dict[str, Judge]:

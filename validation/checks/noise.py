@@ -2,7 +2,7 @@
 
 Along a line of inputs a few float32 steps apart, what a function *should* do is smooth, and differences of
 high order make it vanish; what is left is noise. Digits that are lost leave stairs: those on a slope show at
-no step that is small against them, so that coarser lines are looked at, too.
+no step that is small against them, so coarser lines are examined as well.
 Source: Moré and Wild, "Estimating Computational Noise", SIAM J. Sci. Comput. 33(3), 2011, §§ 3, 5: with T_k
 the differences of order k, σ² ≈ γ_k ⟨T_k²⟩, γ_k = (k!)² / (2k)!.
 """
@@ -81,7 +81,7 @@ def measure(
 
     ``strides``: the most float32 steps between points of a line, ascending; the first counts along which the
     value changes at half of them, since lost digits leave stairs, flat where a line is short. ``project``
-    makes inputs far from the first valid again; with it, ``COARSE`` lines are examined, too. Stairs are as
+    makes inputs far from the first valid again; with it, ``COARSE`` lines are examined as well. Stairs are as
     high at any step that is large compared with them, unlike kinks and what is left of a smooth function:
     only noise that is ``ALIKE`` at two steps counts.
     """

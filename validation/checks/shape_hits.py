@@ -162,7 +162,7 @@ def close(size, si, ray):
 @finds("behind", "hits too far away, in sizes", 5e-7, ray_intersect=too_far)
 @finds("missed", "a least distance for this share of directions", 3e-3, ray_intersect=missed(close))
 def surface(law: Law, case: Case) -> None:
-    """p = o + t d is on the surface; spawned rays do not meet it where they start; digits are kept."""
+    """Hits lie on the ray and the surface; spawned rays do not meet it where they start; digits are kept."""
     met = case.met
     numbers = abs(np.concatenate([met.o, met.p], axis=1))
     along = np.float64(met.o) + met.t[:, None] * met.d
@@ -287,7 +287,7 @@ def inwards(size, si, ray):
 @finds("shading", "shading normals tilted, in radians", 3e-3, ray_intersect=member("sh_frame", tilted_frame))
 @finds("step", "dp_du too long", 0.02, ray_intersect=member("dp_du", larger))
 def normals(law: Law, case: Case) -> None:
-    """n has unit length, points outwards, n · ∂p/∂u = n · ∂p/∂v = 0, and differences of points agree."""
+    """Normals have unit length, point outwards, and agree with partial derivatives and differences."""
     if case.closed:
         judged, even = case.lines
         flipped = isinstance(case.plugin, mi.Shape) and case.plugin.has_flipped_normals()
@@ -363,7 +363,7 @@ def slit_above(size, si, ray):
 @finds("out", "a slit of this width, in sizes", 3e-5, quick=1e-4, ray_intersect=missed(slit))
 @finds("odd", "a slit of this width in one face, in sizes", 6e-3, ray_intersect=missed(slit_above))
 def watertight(law: Law, case: Case) -> None:
-    """Lines enter and leave in turn, and no ray from inside gets out without a hit."""
+    """Lines enter and leave in turn, and no ray escapes from inside."""
     met = case.met
     # else such a ray may fall off an edge, or its offset be larger than the shape
     steep = (abs(met.cos) > 0.5) & (offset(met.p) < 1e-3 * case.size)
@@ -421,7 +421,7 @@ print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}
     ),
 )
 def scale(law: Law, case: Case) -> None:
-    """A millionth and a million times the size: the same, scaled. Powers of two leave no roundings."""
+    """At a millionth and a million times the size, hits are the same, scaled; powers of two round nothing."""
     matrix = getattr(case.with_().get("to_world"), "values", np.eye(4))
     seen = case.seen.only(slice(0, case.count(2**12, 2**14)))
     for power in (-20, -10, 10, 20):
@@ -469,7 +469,7 @@ def afar(size, si, ray):
 @finds("missed", "hits off by this part of a distance above a thousand", 1e-5, ray_intersect=off_from_afar)
 @finds("missed", "misses from afar in this share of directions", 3e-3, ray_intersect=missed(afar))
 def far(law: Law, case: Case) -> None:
-    """Hits from ten thousand sizes away are those of the same lines from nearby, to some roundings."""
+    """Rays from ten thousand sizes away meet what the same lines meet from nearby, to some roundings."""
     met = case.met.only(slice(0, case.count(2**12, 2**15)))
     distance = FAR * case.size
     goal = np.float64(met.p)
@@ -513,7 +513,7 @@ def no_number_in_place(size, si, ray):
 @finds("bad", "NaN where a component of the direction is so small", 1e-12, ray_intersect=no_number_along_axis)
 @finds("million", "NaN for a share of the rays", 2e-6, quick=2e-5, ray_intersect=no_number_in_place)
 def finite(law: Law, case: Case) -> None:
-    """Rays along axes, from the surface, the middle, corners and very far: all results are finite."""
+    """All results are finite: of rays along axes, from the surface, the middle, corners and very far away."""
     met = case.met
     rng = case.rng
     count = case.count(2**12, 2**15)
@@ -591,7 +591,7 @@ def bbox(law: Law, case: Case) -> None:
     ),
 )
 def variants(law: Law, case: Case) -> None:
-    """Hits in the scalar variant against those in the vectorised one."""
+    """Hits in the scalar variant are those of the vectorised one."""
     case.with_()
     other = case.other_kind
     seen = case.seen.only(slice(0, case.count(500, 2000)))

@@ -175,9 +175,10 @@ def too_short(size, ds, it, u):
     sample_direction=member("pdf", smaller),
 )
 def sampling(law: Law, case: Case) -> None:
-    """Positions by area, judged by where lines cross the surface; directions, and the densities of both.
+    """Sampled positions follow the area, and sampled directions the density that they state.
 
-    E[1 / pdf] is the area, and of directions the solid angle of what is seen.
+    Positions are judged by where random lines cross the surface; E[1 / pdf] is the area, and of directions
+    the visible solid angle.
     """
     (p, n, pdf, again), u, area = case.positions
     law.hold("position", abs(pdf / again - 1))

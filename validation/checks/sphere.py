@@ -157,11 +157,12 @@ def hold_small(
     # where densities are not finite, the law ``finite`` says so
     seen, expected, variance = np.where(np.isfinite(expected), [seen, expected, variance], 0)
     chances = chances_of(seen, expected, variance, known)
-    cell = cells.bounds(chances.argmin())
+    cell = cells.bounds(int(chances.argmin()))
     law.hold("small", sidak(chances.min(), 2 * len(chances)), cell=cell, **names)
     rows = []
     for row in cells.rows():
-        rows.append(chances_of(*(np.bincount(row, x) for x in (seen, expected, variance)), known))
+        many, wanted, doubt = (np.bincount(row, x) for x in (seen, expected, variance))
+        rows.append(chances_of(many, wanted, doubt, known))
     chances = np.concatenate(rows)
     law.hold("slices", sidak(chances.min(), 2 * len(chances)), **names)
 
