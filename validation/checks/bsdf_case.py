@@ -140,6 +140,11 @@ class Case(Subject, Probe):
         if not (any(view.density.any() for view in self.views) or self.pairs.value.any()):
             raise Skip("all lobes are single directions (delta): eval and pdf are 0")
 
+    def at_random(self, quick: int, full: int) -> Lanes:
+        """Directions of incidence ``wi`` over the sphere, ``uv``, and random numbers ``u`` for samples."""
+        count = self.count(quick, full)
+        return Lanes(wi=self.units(count), uv=self.uniform(count, 2), u=self.uniform(count, 3))
+
     @cached_property
     def pairs(self) -> Lanes:
         """Directions over the sphere, ``wi`` and ``wo``, some sampled and some at random, at a ``uv`` each.

@@ -105,17 +105,14 @@ def _component(law: Law, case: Case, i: int, flag: int, value: Array) -> int:
     bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(with_width, p.wi, p.wo)
     law.hold("values", bad, p, component=i)
     # samples of one component that go by another name, kind or side
-    count = case.count(2**12, 2**14)
-    wi = case.units(count)
-    u = case.uniform(count, 3)
-    uv = case.uniform(count, 2)
-    s = case.sample(wi, u, uv, context(i))
+    at = case.at_random(2**12, 2**14)
+    s = case.sample(at.wi, at.u, at.uv, context(i))
     drawn = s.lit & np.isfinite(s.weight).all(axis=1)
     bad = (s.component != i) | ((s.type & ~flag) != 0) | (s.type == 0)
-    bad |= (abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, wi, s.wo)
-    law.hold("samples", drawn & bad, component=i, wi=wi, uv=uv, u=u)
+    bad |= (abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, at.wi, s.wo)
+    law.hold("samples", drawn & bad, at, component=i)
     # sides that flags name and where there is no light, of a component that has some
-    z = np.concatenate([p.wi[lit, 2], wi[drawn, 2]])
+    z = np.concatenate([p.wi[lit, 2], at.wi[drawn, 2]])
     if not len(z):
         return 0
     front = _has(flag, mi.BSDFFlags.FrontSide) and not (z > 0).any()
@@ -143,7 +140,7 @@ def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
     kinds = [flag & every for flag in flags]
     p = case.pairs
     at = Lanes(wi=p.wi, uv=p.uv, wo=p.wo)
-    few = at.only(slice(0, case.count(2**12, 2**13)))
+    few = case.few(at, 2**12, 2**13)
     for mask in sorted({*kinds, *(every & ~kind for kind in kinds)} - {0}):
         ctx = context(type_mask=mask)
         chosen = [part for kind, part in zip(kinds, parts, strict=True) if kind & ~mask == 0]
@@ -175,7 +172,8 @@ def variants(law: Law, case: Case) -> None:
     """Values are the same in the scalar variant, and in the spectral one where colours are grey."""
     here = mi.variant()
     case.with_()
-    few = case.pairs.only(np.isfinite(case.pairs.value).all(axis=1)).only(slice(0, case.count(200, 800)))
+    finite = case.pairs.only(np.isfinite(case.pairs.value).all(axis=1))
+    few = case.few(finite, 200, 800)
     grey = np.ptp(few.value, axis=1).max() <= 1e-5 * few.value.max()
     others = [case.other_kind]
     if here.endswith("_rgb") and grey:
@@ -207,7 +205,7 @@ def variants(law: Law, case: Case) -> None:
 def switch(law: Law, case: Case) -> None:
     """Values are the same after a switch to another variant and back, loaded before it or anew."""
     here = mi.variant()
-    few = case.pairs.only(slice(0, case.count(1000, 1000)))
+    few = case.few(case.pairs, 1000, 1000)
     other = next(v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here)
     mi.set_variant(other)
     mi.set_variant(here)

@@ -122,7 +122,7 @@ def _attached(law: Law, case: Case, key: str) -> bool:
     few = case.lit
     (derivative,), attached = _derivatives(case, key, len(few.wi), lambda: [_values(case)])
     broken = ~np.isfinite(derivative)
-    derivative = np.nan_to_num(derivative, posinf=0, neginf=0)
+    derivative = probe.finite_or_0(derivative)
     slope, error = _differences(case, key)
     if not attached and not slope.any():
         law.notes.append(f"{key} changes no value")
@@ -163,15 +163,13 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     Integrators follow a sample as a constant direction. Where one moves with the parameter, its weight may
     change otherwise: only means over smooth light are then the same.
     """
-    count = case.count(2**14, 2**16)
-    wi = case.units(count)
-    u = case.uniform(count, 3)
-    uv = case.uniform(count, 2)
+    at = case.at_random(2**14, 2**16)
+    wi = at.wi
 
     def weights() -> list[mi.Float]:
-        si = probe.interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", uv))
-        sample1 = as_mitsuba("Float", u[:, 0])
-        sample2 = as_mitsuba("Point2f", u[:, 1:])
+        si = probe.interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", at.uv))
+        sample1 = as_mitsuba("Float", at.u[:, 0])
+        sample2 = as_mitsuba("Point2f", at.u[:, 1:])
         bs, weight = case.plugin.sample(context(), si, sample1, sample2)
         value, pdf = case.plugin.eval_pdf(context(), si, dr.detach(bs.wo))
         light = 1 + 0.5 * bs.wo.x + 0.25 * dr.square(bs.wo.z)
@@ -179,9 +177,9 @@ def _sampled(law: Law, case: Case, key: str) -> None:
         by_value = _total(value) / fixed
         return [_total(weight) * light, by_value * dr.detach(light), dr.sum(bs.wo)]
 
-    (derivative, expected, moves), attached = _derivatives(case, key, count, weights)
-    s = case.sample(wi, u, uv)
-    value, pdf = case.both(wi, np.nan_to_num(s.wo), uv)
+    (derivative, expected, moves), attached = _derivatives(case, key, len(wi), weights)
+    s = case.sample(wi, at.u, at.uv)
+    value, pdf = case.both(wi, np.nan_to_num(s.wo), at.uv)
     counts = live(wi, s, value, pdf) & ~narrow(wi, s)
     counts &= np.isfinite(derivative) & np.isfinite(expected) & (abs(wi[:, 2]) > 0.05)
     counts &= (abs(s.wo[:, 2]) > 0.05) & (s.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
@@ -199,7 +197,7 @@ def _sampled(law: Law, case: Case, key: str) -> None:
         figure = "weights"
         known = abs(known)
         off = known[known <= np.quantile(known, 0.98)].mean()
-    law.hold(figure, off / size, wi=wi[i], uv=uv[i], u=u[i], key=key)
+    law.hold(figure, off / size, at.only(i), key=key)
 
 
 def _total(spectrum: mi.Spectrum) -> mi.Float:

@@ -289,13 +289,13 @@ def energy(law: Law, case: Case) -> None:
 
 def _mean(weight: Array) -> tuple[Array, Array]:
     """The mean of finite weights [N, channels], and its standard error."""
-    weight = np.nan_to_num(weight, posinf=0, neginf=0).astype(np.float64)
+    weight = probe.finite_or_0(weight).astype(np.float64)
     return weight.mean(axis=0), weight.std(axis=0) / np.sqrt(len(weight))
 
 
 def _apart(case: Case, view: View, cells: Cells, s: Lanes) -> float:
     """How far the albedo of samples and the integral of eval() differ, beyond chance, relative."""
-    smooth = np.where(s.delta[:, None], 0, np.nan_to_num(s.weight, posinf=0, neginf=0))
+    smooth = np.where(s.delta[:, None], 0, probe.finite_or_0(s.weight))
     mode = context(importance=True)
     integrals = integrate(
         lambda wo: case.eval(view.wi, wo, view.uv, mode),

@@ -174,20 +174,17 @@ def reciprocity(law: Law, case: Case) -> None:
 
 def _delta_either_way(law: Law, case: Case) -> None:
     """Lobes of one direction: probability × weight × η² of a sample, and of the one that goes back."""
-    count = case.count(2**13, 2**15)
-    wi = case.units(count)
-    uv = case.uniform(count, 2)
-    u = case.uniform(count, 3)
-    v = case.uniform(count, 3)
-    forth = case.sample(wi, u, uv)
+    at = case.at_random(2**13, 2**15)
+    at.back = case.uniform(len(at.wi), 3)
+    wi = at.wi
+    forth = case.sample(wi, at.u, at.uv)
     wo = probe.unit(np.where(np.isfinite(forth.wo), forth.wo, 1))
-    back = case.sample(wo, v, uv)
+    back = case.sample(wo, at.back, at.uv)
     same = forth.delta & (forth.type == back.type) & (forth.component == back.component)
     same &= abs(wi[:, 2] * wo[:, 2]) > 1e-3
     returned = (abs(probe.unit(back.wo) - wi) < 1e-3).all(axis=1)
     if same.sum() < 20:
         return
-    at = Lanes(wi=wi, uv=uv, u=u, back=v)
     lost = (same & ~returned).argmax()
     law.hold("returns", returned[same].mean(), at.only(lost))
 
@@ -195,13 +192,13 @@ def _delta_either_way(law: Law, case: Case) -> None:
         s = case.sample(i, u, t)
         return s.weight * (s.pdf * np.float64(s.eta) ** 2)[:, None]
 
-    there = wi, wo, uv, u
-    and_back = wo, wi, uv, v
+    there = wi, wo, at.uv, at.u
+    and_back = wo, wi, at.uv, at.back
     # next to total reflection, a rounding of the direction is a percent of what is transmitted
     allowed = case.spread(followed, *there) + case.spread(followed, *and_back)
     error = excess(followed(*there), followed(*and_back), allowed)
     law.hold("single", np.where(same & returned, error, 0), at)
-    other = case.sample(wi, u, uv, context(importance=True))  # by the same random numbers
+    other = case.sample(wi, at.u, at.uv, context(importance=True))  # by the same random numbers
     alike = forth.delta & (abs(other.wo - forth.wo) < 1e-3).all(axis=1)
     error = excess(forth.weight * forth.eta[:, None] ** 2, other.weight)
     law.hold("single_modes", np.where(alike, error, 0), at)
@@ -355,7 +352,7 @@ def roundoff(law: Law, case: Case) -> None:
     steep = (abs(p.wi[:, 2]) > 0.1) & (abs(p.wo[:, 2]) > 0.1)
     # far off a lobe, an exponent of 40 makes 40 roundings of one: of nothing
     lit = p.only(steep & (p.pdf > 1e-3) & (p.value.max(axis=1) > 1e-20))
-    few = lit.only(slice(0, case.count(500, 2000)))
+    few = case.few(lit, 500, 2000)
     if len(few.pdf) < 20:
         raise Skip("too few pairs of directions with a value")
     inputs = np.concatenate([few.wi, few.wo], axis=1)

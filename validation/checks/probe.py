@@ -243,9 +243,14 @@ def spread(
     return largest
 
 
+def finite_or_0(values: Array) -> Array:
+    """Values, and 0 for those that are not finite, which are left to the law ``finite``."""
+    return np.nan_to_num(values, posinf=0, neginf=0)
+
+
 def without_density(value: Array, pdf: Array) -> Array:
     """The share of all light [N, channels] that each direction carries, where its density [N] is 0. [N]"""
-    light = np.nan_to_num(value, posinf=0, neginf=0).sum(axis=1)
+    light = finite_or_0(value).sum(axis=1)
     return np.where(pdf == 0, light, 0) / max(light.sum(), 1e-30)
 
 

@@ -191,7 +191,7 @@ def _again(law: Law, case: Case) -> None:
 
 def _noise(law: Law, case: Case) -> None:
     """The noise of distance, hit point and normal."""
-    met = case.met.only(slice(0, case.count(300, 1000)))
+    met = case.few(case.met, 300, 1000)
     scale = abs(met.o).max(axis=1) + met.t
     inputs = np.concatenate([met.o, met.d], axis=1)
 
@@ -208,7 +208,7 @@ def _noise(law: Law, case: Case) -> None:
 
 def _from_near_by(law: Law, case: Case) -> None:
     """From near by, and from the other side, numbers are small, and points that are off show."""
-    met = case.met.only(slice(0, case.count(2**12, 2**15)))
+    met = case.few(case.met, 2**12, 2**15)
     d = met.d
     reach = 0.05 * case.size
     again = trace(case.target, np.float32(met.p - reach * d), d)
@@ -423,7 +423,7 @@ print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}
 def scale(law: Law, case: Case) -> None:
     """At a millionth and a million times the size, hits are the same, scaled; powers of two round nothing."""
     matrix = getattr(case.with_().get("to_world"), "values", np.eye(4))
-    seen = case.seen.only(slice(0, case.count(2**12, 2**14)))
+    seen = case.few(case.seen, 2**12, 2**14)
     for power in (-20, -10, 10, 20):
         larger = np.diag([2.0**power] * 3 + [1]) @ matrix
         to_world = mi.ScalarTransform4f(larger)
@@ -470,7 +470,7 @@ def afar(size, si, ray):
 @finds("missed", "misses from afar in this share of directions", 3e-3, ray_intersect=missed(afar))
 def far(law: Law, case: Case) -> None:
     """Rays from ten thousand sizes away meet what the same lines meet from nearby, to some roundings."""
-    met = case.met.only(slice(0, case.count(2**12, 2**15)))
+    met = case.few(case.met, 2**12, 2**15)
     distance = FAR * case.size
     goal = np.float64(met.p)
     d = met.d
@@ -594,7 +594,7 @@ def variants(law: Law, case: Case) -> None:
     """Hits in the scalar variant are those of the vectorised one."""
     case.with_()
     other = case.other_kind
-    seen = case.seen.only(slice(0, case.count(500, 2000)))
+    seen = case.few(case.seen, 500, 2000)
     there = case.elsewhere(other, lambda: trace(case.scene(), seen.o, seen.d))
     law.hold("answer", (there.met != seen.met) & (seen.steep | ~seen.met), seen, other=other)
     error = abs(there.t - seen.t) / (ROUNDING * (abs(seen.o).max(axis=1) + seen.t))

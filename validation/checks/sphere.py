@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 
 from mrt_mitsuba.validation.checks.law import Law
-from mrt_mitsuba.validation.checks.probe import Array, Lanes, joined
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, finite_or_0, joined
 from mrt_mitsuba.validation.tools.compare import sidak
 
 DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
@@ -197,7 +197,7 @@ def integrate(
     """
 
     def finite(wo: Array) -> Array:
-        return np.nan_to_num(function(wo), posinf=0, neginf=0)
+        return finite_or_0(function(wo))
 
     done = []
     order = np.argsort(codes)

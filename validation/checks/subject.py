@@ -18,7 +18,7 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.scene.loading import load_dict
 from mrt_mitsuba.validation.checks.law import Description, Found, Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, is_scalar, stratified, unit
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, is_scalar, stratified, unit
 
 Given = Any  # such a dict, a value of one, or a loaded plugin
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
@@ -88,6 +88,10 @@ class Subject:
         """How many lanes to use."""
         number = quick if self.quick else full
         return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
+
+    def few(self, lanes: Lanes, quick: int, full: int) -> Lanes:
+        """The first lanes, so many."""
+        return lanes.only(slice(0, self.count(quick, full)))
 
     def program(self, body: str, **names: Any) -> str:
         """A program that loads the plugin and runs ``body``, filled with ``names``."""
