@@ -138,8 +138,8 @@ class Case(Subject):
         return trace(self.target, leave(self.met, d), -d)
 
     @cached_property
-    def positions(self) -> tuple[list[Array], Array, float]:
-        """Sampled positions: points, normals, densities stated and asked for; their ``u``; and the area."""
+    def positions(self) -> tuple[Lanes, float]:
+        """Sampled positions ``p`` with ``n``, ``pdf`` as stated and ``again`` as asked for; and the area."""
         u = self.uniform(self.count(2**16, 2**19), 2)
 
         def sample(second: mi.Point2f) -> list[mi.Float]:
@@ -148,7 +148,7 @@ class Case(Subject):
 
         try:
             area = float(np.ravel(np.array(self.plugin.surface_area()))[0])
-            return lanes(sample, ("Point2f", u)), u, area
+            return named("p n pdf again", lanes(sample, ("Point2f", u))), area
         except (AttributeError, RuntimeError) as problem:
             raise Skip("positions cannot be sampled") from problem
 

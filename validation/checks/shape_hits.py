@@ -574,7 +574,7 @@ def bbox(law: Law, case: Case) -> None:
     met = case.met
     points = [met.p, case.points]
     with suppress(Skip):
-        points.append(case.positions[0][0])
+        points.append(case.positions[0].p)
     p = np.concatenate(points)
     out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
     worst = min(out.argmax(), len(met.t) - 1)

@@ -180,31 +180,27 @@ def sampling(law: Law, case: Case) -> None:
     Positions are judged by where random lines cross the surface; E[1 / pdf] is the area, and of directions
     the visible solid angle.
     """
-    (p, n, pdf, again), u, area = case.positions
-    law.hold("position", abs(pdf / again - 1))
-    law.hold("area", abs(np.mean(1 / pdf) / area - 1))
-    few = slice(0, case.count(2**14, 2**17))
+    s, area = case.positions
+    law.hold("position", abs(s.pdf / s.again - 1))
+    law.hold("area", abs(np.mean(1 / s.pdf) / area - 1))
     # sampled positions, and their normals, as rays meet them
-    start = np.float32(p + n * 0.01 * case.size)[few]
-    inwards = -n[few]
-    back = trace(case.target, start, unit(inwards))
+    few = case.few(s, 2**14, 2**17)
+    back = trace(case.target, np.float32(few.p + few.n * 0.01 * case.size), unit(-few.n))
     # another part of the surface may be nearer than a hundredth of the size
-    away = np.where(back.met, norm(back.p - p[few], axis=1), np.inf)
-    scale = abs(p[few]).max(axis=1) + 0.01 * case.size
+    away = np.where(back.met, norm(back.p - few.p, axis=1), np.inf)
+    scale = abs(few.p).max(axis=1) + 0.01 * case.size
     law.hold("off", away / (ROUNDING * scale), back)
     if back.met.any():
-        cosine = np.minimum(dot(-inwards, back.shading), dot(-inwards, back.n))
-        cosine = cosine / norm(inwards, axis=1)
-        off = np.where(back.met, 1 - cosine, np.nan)
-        law.hold("normal", off, back)
+        cosine = np.minimum(dot(few.n, back.shading), dot(few.n, back.n)) / norm(few.n, axis=1)
+        law.hold("normal", np.where(back.met, 1 - cosine, np.nan), back)
     if case.behind.met.mean() > 0.5:
-        _area(law, case, p, n, area)
+        _area(law, case, s, area)
     else:
         law.notes.append("rays pass it from behind: their crossings do not count its area")
-    _directions(law, case, u[few])
+    _directions(law, case)
 
 
-def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
+def _area(law: Law, case: Case, s: Lanes, area: float) -> None:
     """Random lines cross a surface in proportion to its area, whatever its form (Crofton)."""
     count = case.count(2**17, 2**20)
     radius = 0.5 * case.size * 1.001
@@ -213,11 +209,11 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     disk = radius * np.sqrt(case.rng.random((count, 1))) * across
     start = np.float32(case.middle + disk - 2 * radius * d)
     # where two parts of the surface coincide, a line meets only one of them
-    at = Lanes(p=p, n=unit(n))
+    at = Lanes(p=s.p, n=unit(s.n))
     one = trace(case.target, leave(at, at.n), -at.n)
     other = trace(case.target, leave(at, -at.n), at.n)
     both = one.met & other.met & (one.part != other.part)
-    twice = (both & near(p, one.p) & near(p, other.p)).mean()
+    twice = (both & near(s.p, one.p) & near(s.p, other.p)).mean()
     crossed = np.zeros(count)
     points = []
     for line, hits in walk(case.target, trace(case.target, start, d)):
@@ -227,20 +223,20 @@ def _area(law: Law, case: Case, p: Array, n: Array, area: float) -> None:
     estimate = 2 * np.pi * radius**2 * crossed.mean()
     error = 2 * np.pi * radius**2 * crossed.std() / np.sqrt(count)
     beyond = max(abs(estimate - area) - SIGMAS * error, 0)
-    room = 3e-3 + 20 * float(offset(p).max()) / case.size + twice
+    room = 3e-3 + 20 * float(offset(s.p).max()) / case.size + twice
     law.hold("crossings", beyond / area, limit=room)
     if twice > ROOM:
         law.notes.append("parts of it coincide: where positions lie is not judged")
         return
     # crossings of a line come together
-    size = 1 / (1 / len(p) + (crossed**2).sum() / crossed.sum() / len(crossings))
+    size = 1 / (1 / len(s.p) + (crossed**2).sum() / crossed.sum() / len(crossings))
     axes = case.units(AXES)
-    apart = [_distance(p @ axis, crossings @ axis) for axis in axes]
+    apart = [_distance(s.p @ axis, crossings @ axis) for axis in axes]
     for axis in np.eye(3):
         across = crossings - np.outer(crossings @ axis, axis)
         widths = np.linalg.svd(np.cov(across.T), compute_uv=False)
         if widths[1] >= 1e-4 * widths[0]:  # else in one plane with the axis: azimuths around it are but two
-            apart.append(_distance(_angle(p - case.middle, axis), _angle(crossings - case.middle, axis)))
+            apart.append(_distance(_angle(s.p - case.middle, axis), _angle(crossings - case.middle, axis)))
     law.hold("spread", _chance(apart, size))
 
 
@@ -283,8 +279,9 @@ def _chance(apart: Sequence[float], size: float) -> float:
     return sidak(chance, len(apart))
 
 
-def _directions(law: Law, case: Case, u: Array) -> None:
+def _directions(law: Law, case: Case) -> None:
     """``sample_direction`` from outside: meets the shape, and states its own density."""
+    u = case.uniform(case.count(2**14, 2**17), 2)
     o = case.around(len(u))
     try:
         d, dist, pdf, again = _sampled(case, o, u)
