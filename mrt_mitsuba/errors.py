@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import sys
+import warnings
 from collections.abc import Iterator
 
 LONGEST = 800  # characters of a message
+PACKAGES = ("mrt_mitsuba", "mitsuba", "drjit")  # whose lines say nothing to a user
 NOT_INSTALLED = "{} is not installed: pip install 'mrt-mitsuba[{}]'"
 
 
@@ -76,3 +79,13 @@ def needs_extra(extra: str = "validation") -> Iterator[None]:
     except ModuleNotFoundError as error:
         name = str(error.name).partition(".")[0]
         raise MrtError(NOT_INSTALLED.format(name, extra)) from error
+
+
+def warn(text: str) -> None:
+    """Give a ``MrtWarning`` at the user's line: the innermost outside of this package and of Mitsuba."""
+    frame = sys._getframe(1)
+    level = 2
+    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in PACKAGES:
+        frame = frame.f_back
+        level += 1
+    warnings.warn(text, MrtWarning, stacklevel=level)

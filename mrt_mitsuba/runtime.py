@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import warnings
 from collections.abc import Iterator
 from functools import cache
 
@@ -12,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mrt_mitsuba import llvm, mitsuba_changes, plugins
-from mrt_mitsuba.errors import MrtWarning, UnknownVariantError, VariantError
+from mrt_mitsuba.errors import UnknownVariantError, VariantError, warn
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.mitsuba_changes import one_at_a_time
@@ -122,7 +121,7 @@ def _warn_once(text: str) -> None:
     global _warned
     if not _warned:
         _warned = True
-        warnings.warn(text, MrtWarning, stacklevel=4)
+        warn(text)
 
 
 def usable_variants() -> list[str]:

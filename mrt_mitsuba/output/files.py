@@ -7,13 +7,12 @@ import json
 import os
 import stat
 import sys
-import warnings
 from collections import namedtuple
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Any
 
-from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
+from mrt_mitsuba.errors import OutputError, UsageError, warn
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.output.replacing import replacing
@@ -263,4 +262,4 @@ def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]
             values = encoded * 255 + 0.5
         yield row, values.astype(np.uint8)
     if lost:
-        warnings.warn(f"{lost} pixels are NaN; the PNG holds 0 there", MrtWarning, stacklevel=4)
+        warn(f"{lost} pixels are NaN; the PNG holds 0 there")

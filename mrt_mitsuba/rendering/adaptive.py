@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.errors import UsageError, warn
 from mrt_mitsuba.options import TARGET, check
 from mrt_mitsuba.plugins.parameters import ParameterError, integer, number
 from mrt_mitsuba.plugins.variants import construct_quietly, text_of
@@ -94,7 +93,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         from mrt_mitsuba.scene.open import opened
 
         if 0 < spp < FEWEST:
-            warnings.warn(f"mrt_adaptive takes {FEWEST} rays a pixel at least, not spp={spp}", stacklevel=2)
+            warn(f"mrt_adaptive takes {FEWEST} rays a pixel at least, not spp={spp}")
         number = sensor if isinstance(sensor, int) else 0
         view = _sensor(scene, sensor)
         seed = int(np.ravel(seed)[0]) % 2**32

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 import time
-import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from mrt_mitsuba.errors import MrtWarning
+from mrt_mitsuba.errors import warn
 from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, Round, RoundPicture
 from mrt_mitsuba.rendering.noise import SUSPECT, estimate
 from mrt_mitsuba.rendering.progress import Advance
@@ -90,7 +89,7 @@ def run_rounds(noise: Noise, stage: Stage, goal: Goal, on_round: OnRound | None 
     error = replace(estimate(noise, state), target=target)
     found = [state.unfit_rays(), _doubt(error), "" if stopped else _missed(goal, now, error)]
     if any(found):
-        warnings.warn("; ".join(filter(None, found)), MrtWarning, stacklevel=7)  # the caller of render
+        warn("; ".join(filter(None, found)))
     return Finished(done, state, error)
 
 

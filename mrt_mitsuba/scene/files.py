@@ -6,11 +6,10 @@ import io
 import os
 import re
 import stat
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
-from mrt_mitsuba.errors import MrtWarning, SceneError
+from mrt_mitsuba.errors import SceneError, warn
 
 DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
 LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
@@ -96,12 +95,12 @@ def picture_size(path: str) -> tuple[int, int] | None:
         return None
 
 
-def warn(findings: Mapping[str, list[str]]) -> None:
+def warn_of(findings: Mapping[str, list[str]]) -> None:
     """Warn of findings, by kind in the plural: of the first, with the number of the others."""
     for kind, texts in findings.items():
         more = f" (and so do {len(texts) - 1} more {kind})" if texts[1:] else ""
         if texts:
-            warnings.warn(f"{texts[0]}{more}", MrtWarning, stacklevel=4)
+            warn(f"{texts[0]}{more}")
 
 
 def declared(path: str) -> dict[str, str]:

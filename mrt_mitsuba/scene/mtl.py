@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError
-from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn
+from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
 from mrt_mitsuba.scene.model import LARGEST, Color, Material
 
 # What the statements mean, by convention: fields of ``Material``
@@ -73,7 +73,7 @@ def read_mtl(
             plain = re.sub(r"\.0+\b", "", f"{statement} {text}")
             if plain not in _WITHOUT_EFFECT:
                 findings.setdefault("statements", []).append(f"{where}: {statement} {text[:40]} is not used")
-    warn(findings)
+    warn_of(findings)
     default = DEFAULT_MATERIAL if convention == "report" else _STANDARD
     return {name: replace(default, **block) for name, block in blocks.items()}
 

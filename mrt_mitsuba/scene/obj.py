@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn
+from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
 from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Color, Light, Material, Mesh, Scene, Vector
 from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
 
@@ -180,7 +180,7 @@ class _Reader:
             for name, where in self.named.items()
             if name not in self.materials
         ]
-        warn({"libraries": self.missing, "materials": unknown})
+        warn_of({"libraries": self.missing, "materials": unknown})
         parts: dict[tuple[Material, bool], list[np.ndarray]] = {}
         for faces, kinds, name, line in self.faces:
             counts = np.array([*self.counts.values()])[kinds]

@@ -12,12 +12,11 @@ import json
 import os
 import re
 import shutil
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mrt_mitsuba.errors import MrtWarning, OutputError
+from mrt_mitsuba.errors import OutputError, warn
 from mrt_mitsuba.output.replacing import temporary_folder, unfinished
 
 LOCK = ".mrt-sweep.lock"
@@ -79,7 +78,7 @@ def _locked(folder: str) -> Iterator[bool]:
     unfinished.add(path)
     if file is None:
         text = f"the file system of {folder} has no locks: see to it that no other sweep writes there"
-        warnings.warn(text, MrtWarning, stacklevel=7)
+        warn(text)
     try:
         yield file is not None
     finally:

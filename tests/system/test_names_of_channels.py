@@ -174,6 +174,27 @@ def test_an_integrator_may_render_by_itself(base, options):
         assert_allclose(mrt.render(loaded, **options).image, 0.25)
 
 
+@pytest.mark.parametrize("door", ["render", "prepare", "again", "mi.render"])
+def test_a_warning_names_the_line_of_the_user(door):
+    """That of another file is of no use, and Python shows one warning only for each line."""
+    loaded = scene({"type": "path"})
+    options = {"target": 1e-6, "maxspp": 16}
+    adaptive = mi.load_dict(
+        {"type": "mrt_adaptive", "target": 1e-6, "max_spp": 16, "nested": {"type": "path"}}
+    )
+    with pytest.warns(mrt.MrtWarning, match="target") as warned:
+        if door == "render":
+            mrt.render(loaded, **options)
+        elif door == "mi.render":
+            np.array(mi.render(loaded, integrator=adaptive))
+        else:
+            again = mrt.prepare(loaded, **options)
+            if door == "again":
+                warned.clear()
+                again()
+    assert {each.filename for each in warned} == {__file__}
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 2)])
 def test_the_smallest_films_print_nothing(variant, size, capfd):
