@@ -536,6 +536,8 @@ class RayNoise:
         rounding = rounding.ravel()[some]
         known = have.sum()
         best = np.zeros(self.film.pixels, np.int64)
+        if not deviation.any():
+            return best
         low = 0.0
         high = min(factor, (room + known) / deviation.sum())
         factor = min(factor, _factor(deviation, None, have, room, 0.0))
