@@ -8,7 +8,8 @@ import warnings
 from collections.abc import Iterator
 
 LONGEST = 800  # characters of a message
-PACKAGES = ("mrt_mitsuba", "mitsuba", "drjit")  # whose lines say nothing to a user
+# Whose lines say nothing to a user: this package, and what calls it back
+PACKAGES = ("mrt_mitsuba", "mitsuba", "drjit", "contextlib")
 NOT_INSTALLED = "{} is not installed: pip install 'mrt-mitsuba[{}]'"
 
 
@@ -82,7 +83,7 @@ def needs_extra(extra: str = "validation") -> Iterator[None]:
 
 
 def warn(text: str) -> None:
-    """Give a ``MrtWarning`` at the user's line: the innermost outside of this package and of Mitsuba."""
+    """Give a ``MrtWarning`` at the user's line: the innermost outside of ``PACKAGES``."""
     frame = sys._getframe(1)
     level = 2
     while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in PACKAGES:
