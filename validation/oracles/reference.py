@@ -172,10 +172,14 @@ def specular_lobe(n: Array, to_light: Array, to_eye: Array, alpha: Array) -> Arr
     sin2 = np.square(np.cross(n, h)).sum(axis=-1)
     lobe = np.exp(-sin2 / cos2 / alpha**2) / (math.pi * alpha**2 * cos2**2)
     for way in (to_light, to_eye):
-        a = np.minimum(dot(n, way) / (alpha * norm(np.cross(n, way), axis=-1)), 1.6)
-        fit = a * (3.535 + 2.181 * a) / (1 + a * (2.276 + 2.577 * a))
-        lobe = lobe * np.where(a < 1.6, fit, 1.0)
+        lobe = lobe * smith_g1(dot(n, way) / (alpha * norm(np.cross(n, way), axis=-1)))
     return lobe / (4 * dot(n, to_light) * dot(n, to_eye))
+
+
+def smith_g1(a: Array) -> Array:
+    """The rational fit of G₁ by 1 / (alpha tan θ)."""
+    fit = a * (3.535 + 2.181 * a) / (1 + a * (2.276 + 2.577 * a))
+    return np.where(a < 1.6, fit, 1.0)
 
 
 # ------------------------------------------------- Objects -------------------------------------------------

@@ -87,16 +87,12 @@ WIDTHS: dict[Number, int] = {0: 720, 1: 640, 2: 560, 3: 480, 4: 400}
 
 
 def shown(scene: Number) -> Cost:
-    """What the documentation measures in a scene."""
+    """The cost of the documentation's measurements in a scene."""
     width = WIDTHS.get(scene, DOCS.size[0])
     return replace(DOCS, size=(width, width * 3 // 4))
 
 
-Limit = tuple[str, float, float, str]  # what is measured, how much, the most that it may be, and why
-
-
-def unlimited(found: Findings) -> Sequence[Limit]:
-    return ()
+Limit = tuple[str, float, float, str]  # a figure's name, its value, the largest one allowed, and the reason
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +105,7 @@ class Trade:
     cases: dict[str, Options]
     reference: Any
     shared: Options = field(default_factory=dict)
-    limits: Callable[[Findings], Sequence[Limit]] = unlimited
+    limits: Callable[[Findings], Sequence[Limit]] | None = None
 
     def measure(self, cost: Cost, progress: Progress | None = None) -> Findings:
         """Render all cases."""
@@ -133,13 +129,14 @@ def run(study: Study, *, quick: bool) -> None:
         found = trade.measure(cost)
         where = f"{title_of(number).lower()}, {name}"
         describe(study, found, where, f"{title_of(number)}: {trade.title}", trade.truth)
-        for what, measured, most, reason in () if found.failed else trade.limits(found):
-            study.at_most(f"{where}: {what}", measured, most, reason)
+        if trade.limits and not found.failed:
+            for what, *limit in trade.limits(found):
+                study.at_most(f"{where}: {what}", *limit)
         del trade, found  # what holds them is freed with them
 
 
 def choices(number: Number, cost: Cost = DOCS, progress: Progress | None = None) -> dict[str, Findings]:
-    """Measure all that a user can choose in a scene, by a title for each of the two truths.
+    """Measure everything that a user can choose in a scene, by a title for each of the two truths.
 
     ``mrt_whitted`` and ``path`` converge to pictures of their own. The Cornell box has paths alone; scenes
     whose highlights are so narrow that rare paths rule the error have none, unless ``cost`` is full.
@@ -155,7 +152,7 @@ def choices(number: Number, cost: Cost = DOCS, progress: Progress | None = None)
 
 
 def advice(panels: Mapping[str, Findings]) -> list[Options]:
-    """Rows that say what to use to get to an error, for each title of ``choices``."""
+    """Rows that name the settings to use to get to an error, for each title of ``choices``."""
     return [{"in": title, **row} for title, found in panels.items() for row in found.advice()]
 
 
@@ -172,12 +169,8 @@ def rmse(found: Findings, case: str) -> float:
 def judged(found: Findings, case: str) -> Limit:
     """The limit of the reference's error, by the case of least error."""
     why = "then it changes no error by more than an eighth, and the judge is better than the judged"
-    return (
-        "error of the reference / least error it judges",
-        found.reference_error / rmse(found, case),
-        0.5,
-        why,
-    )
+    share = found.reference_error / rmse(found, case)
+    return "error of the reference / least error it judges", share, 0.5, why
 
 
 def _scene(number: Number, size: tuple[int, int], **options: Any) -> Options:
@@ -191,7 +184,7 @@ def _scene(number: Number, size: tuple[int, int], **options: Any) -> Options:
 
 
 def _rounds(cost: Cost, **options: Any) -> dict[str, Options]:
-    """Renders whose rays go to noise, so many of them or to an error."""
+    """Renders whose rays go where the noise is, of a number of rays or to an error."""
     own = {"aa": None, "lattice": None, **options}
     most = 4 * max(cost.rounds, default=1)
     cases = {f"aamode=noise spp={spp}": {**own, "aamode": "noise", "spp": spp} for spp in cost.rounds}
@@ -200,7 +193,7 @@ def _rounds(cost: Cost, **options: Any) -> dict[str, Options]:
 
 
 def sampling(number: int, cost: Cost) -> Trade:
-    """Which pixels get how many samples, and where in the pixel."""
+    """Compare the modes of anti-aliasing, numbers of samples and lattices."""
     least = cost.amounts[0]
     greatest = cost.amounts[-1]
     few = f"none aa={least} centered"
@@ -234,7 +227,7 @@ def sampling(number: int, cost: Cost) -> Trade:
 
 
 def whitted(number: int, cost: Cost) -> Trade:
-    """Cut-off, bounce limit and form of the Fresnel factor, at the same samples."""
+    """Compare cut-offs, bounce limits and forms of the Fresnel factor, with the same samples."""
 
     def integrator(**parameters: Any) -> Options:
         return {"integrator": {"type": "mrt_whitted", **parameters}}
@@ -267,15 +260,16 @@ def whitted(number: int, cost: Cost) -> Trade:
 
 
 def path(number: Number, cost: Cost) -> Trade:
-    """Return Mitsuba's path and direct at rising spp, and mrt_whitted, against converged path."""
+    """Compare Mitsuba's path and direct at rising spp, and mrt_whitted, with a converged path."""
     nodes = _scene(number, cost.path_size)
-    kinds = ("path", "direct") if number in CALM else ("path",)
+    calm = number in CALM
+    kinds = ("path", "direct") if calm else ("path",)
     cases = {f"{kind} spp={spp}": {"integrator": kind, "spp": spp} for kind in kinds for spp in cost.counts}
     for sampler in cost.samplers:
         sensor = nodes["sensor"] | {"sampler": {"type": sampler}}
         own = {"scene": nodes | {"sensor": sensor}, "integrator": "path"}
         cases |= {f"{sampler} spp={spp}": {**own, "spp": spp} for spp in cost.sampler_counts}
-    if number in CALM and cost.counts:
+    if calm and cost.counts:
         cases["mrt_whitted"] = {}
         cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
 
@@ -294,7 +288,7 @@ def path(number: Number, cost: Cost) -> Trade:
         cases=cases | _rounds(cost, integrator="path"),
         reference={"integrator": "path", "spp": cost.path_spp},
         shared={"aa": 1, "aamode": "none"},
-        limits=limits if number in CALM and cost.counts else unlimited,
+        limits=limits if calm and cost.counts else None,
     )
 
 

@@ -17,7 +17,8 @@ from scipy.special import erfc
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.output.files import write_exr
-from mrt_mitsuba.validation.checks.probe import Array, is_scalar
+from mrt_mitsuba.validation.checks.probe import is_scalar
+from mrt_mitsuba.validation.oracles.reference import smith_g1
 from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, lobe_pairs, relative_error
 from mrt_mitsuba.validation.tools.compare import compare, p_values
 from mrt_mitsuba.validation.tools.scenery import ball_scene
@@ -44,13 +45,13 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def ours(alpha: float, *, visible: bool = True) -> Values:
-    """Return ``mrt_bsdf`` with F = 1 and no diffuse part."""
+    """``mrt_bsdf`` with F = 1 and no diffuse part."""
     lobe = {"fresnel": "unity", "diffuse_reflectance": 0.0}
     return {"type": "mrt_bsdf", **lobe, "alpha": alpha, "sample_visible": visible}
 
 
 def theirs(alpha: float, *, visible: bool = True) -> Values:
-    """Return ``roughconductor`` with F = 1."""
+    """``roughconductor`` with F = 1."""
     lobe = {"material": "none", "distribution": "beckmann"}
     return {"type": "roughconductor", **lobe, "alpha": alpha, "sample_visible": visible}
 
@@ -62,24 +63,23 @@ def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> dict[str, f
     the rounding of the length of ωo, by 6e-8 / |ωi + ωo|².
     """
     wi, wo = lobe_pairs(count, alpha, seed=seed)
-
-    def both(visible: bool) -> list[list[Array]]:
+    values = []
+    densities = []
+    for visible in (True, False):
         bsdfs = [mi.load_dict(of(alpha, visible=visible)) for of in (ours, theirs)]
-        return [evaluate(bsdf, wi, wo) for bsdf in bsdfs]
-
-    visible = both(True)
-    plain = both(False)
-    value = np.max([relative_error(one[0], other[0]) for one, other in (visible, plain)])
+        one, other = (evaluate(bsdf, wi, wo) for bsdf in bsdfs)
+        values.append(relative_error(one[0], other[0]))
+        densities.append([one[1], other[1]])
     # In the density of visible normals, roughconductor takes the rational fit of G₁(ωi) for the normaliser
     # 1 / (1 + Λ(ωi)), and is off by up to 0.4 %: bring it to integrate to one
     x, y, z = wi.astype(float).T
     b = z / np.maximum(alpha * np.hypot(x, y), 1e-30)
     smith = np.exp(-(np.minimum(b, 30) ** 2)) / (2 * np.sqrt(np.pi) * b) - erfc(b) / 2
-    fit = np.where(b < 1.6, b * (3.535 + 2.181 * b) / (1 + b * (2.276 + 2.577 * b)), 1)
-    of_visible = relative_error(visible[0][1], visible[1][1] / ((1 + smith) * fit)).max()
+    densities[0][1] = densities[0][1] / ((1 + smith) * smith_g1(b))
+    of_visible, of_plain = (relative_error(*pair) for pair in densities)
     long = ((wi.astype(float) + wo) ** 2).sum(axis=-1) >= SHORT
-    of_plain = relative_error(plain[0][1], plain[1][1])[long].max()
-    return {name: float(x) for name, x in zip(NAMES, (value, of_visible, of_plain), strict=True)}
+    figures = (np.max(values), of_visible.max(), of_plain[long].max())
+    return {name: float(x) for name, x in zip(NAMES, figures, strict=True)}
 
 
 def pointwise(study: Study, *, quick: bool) -> None:

@@ -46,6 +46,8 @@ class Extent(NamedTuple):
     growth: int  # how many times larger the larger task is, and of how many objects crowds are
 
 
+# direct light alone, as Mitsuba's ``direct`` has it
+DIRECT: Nodes = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
 FULL = Extent(400, 300, 16, (0, 1, 2, 3, 4), 11, 1000)
 QUICK = Extent(48, 36, 16, (0,), 1, 16)
 
@@ -54,7 +56,8 @@ class Pair(NamedTuple):
     """Two runs to compare; ``agree`` says how far they are from what they must share: at most ``limit``."""
 
     name: str
-    make: Callable[[], tuple[Run, Run]]
+    ours: Callable[[], Run]  # loads a scene
+    other: Callable[[], Run]
     goal: float  # of the ratio of seconds
     agree: Callable[[Run, Run], float]
     limit: float
@@ -82,7 +85,8 @@ def run(study: Study, *, quick: bool) -> None:
 
 def compare(pair: Pair, repeats: int) -> tuple[dict[str, float], float]:
     """Time a pair in turns, and say by how much it disagrees."""
-    ours, other = pair.make()
+    ours = pair.ours()
+    other = pair.other()
     off = pair.agree(ours, other)
     time = ratio(ours, other, repeats=repeats)
     del ours, other
@@ -112,41 +116,39 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
     # random lights and paths leave half a percent at the size of the quick study
     same = 0.03, "the same light, else it would be no comparison; the rest is noise. One light less shows"
 
-    def nodes(number: int, **options: Any) -> Nodes:
-        return mrt.scene_dict(number, width=extent.width, height=extent.height, **options)
+    def nodes(number: int, flavor: str = "stock") -> Nodes:
+        return mrt.scene_dict(number, width=extent.width, height=extent.height, flavor=flavor)
 
     def other_light(ours: Run, other: Run, factor: float = 1) -> float:
         brightness = np.mean(ours(), dtype=np.float64)
         return abs(np.mean(other(), dtype=np.float64) / brightness / factor - 1)
 
-    def direct(number: int, flavor: str) -> tuple[Run, Run]:
+    def by(integrator: Nodes, number: int, flavor: str) -> Run:
         """Direct light in the scene of a flavour, with Mitsuba's lights in place of ours."""
-        stock = nodes(number, flavor="stock")
-        own = nodes(number, flavor=flavor)
-        lights = {name: node for name, node in stock.items() if name.startswith("light_")}
+        own = nodes(number, flavor)
         del own["sky"]  # direct would sample it, mrt_whitted does not
-        ours = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
-        theirs = {"type": "direct", "emitter_samples": len(lights), "bsdf_samples": 0}
-        return _by_mitsuba(own | lights, ours, extent.spp), _by_mitsuba(own | lights, theirs, extent.spp)
+        lights = {name: node for name, node in nodes(number).items() if name.startswith("light_")}
+        return _by_mitsuba(own | lights, integrator, extent.spp)
 
-    def materials(number: int) -> tuple[Run, Run]:
-        """The scene of Mitsuba's plugins, with either material in place of ``roughplastic``."""
-        stock = nodes(number, flavor="stock")
+    def of(bsdf: Callable[[float], Nodes], number: int) -> Run:
+        """The scene of Mitsuba's plugins, with a material in place of ``roughplastic``."""
+        stock = nodes(number)
         keep = "specular_reflectance"
         plastics = {n: m for n, m in stock.items() if isinstance(m, dict) and m["type"] == "roughplastic"}
-
-        def side(bsdf: Callable[[float], Nodes]) -> Run:
-            metals = {name: bsdf(node["alpha"]) | {keep: node[keep]} for name, node in plastics.items()}
-            return _by_mitsuba(stock | metals, None, extent.spp)
-
-        return side(roughconductor.ours), side(roughconductor.theirs)
+        metals = {name: bsdf(node["alpha"]) | {keep: node[keep]} for name, node in plastics.items()}
+        return _by_mitsuba(stock | metals, None, extent.spp)
 
     for n in extent.scenes:
         lights = sum(key.startswith("light_") for key in nodes(n))
+        direct = {"type": "direct", "emitter_samples": lights, "bsdf_samples": 0}
+        brighter = partial(other_light, factor=lights)
         for flavor, whose in (("mrt", "our"), ("stock", "Mitsuba's")):
             name = f"mrt_whitted / direct, scene {n}, {whose} shapes and materials"
-            yield Pair(name, partial(direct, n, flavor), 0.9, partial(other_light, factor=lights), *same)
-        yield Pair(f"mrt_bsdf / roughconductor, scene {n}", partial(materials, n), 1.05, other_light, *same)
+            yield Pair(
+                name, partial(by, DIRECT, n, flavor), partial(by, direct, n, flavor), 0.9, brighter, *same
+            )
+        sides = partial(of, roughconductor.ours, n), partial(of, roughconductor.theirs, n)
+        yield Pair(f"mrt_bsdf / roughconductor, scene {n}", *sides, 1.05, other_light, *same)
 
 
 def other_ways(extent: Extent) -> Iterator[Pair]:
@@ -165,18 +167,20 @@ def other_ways(extent: Extent) -> Iterator[Pair]:
 
     why = "grazing rays may go either way in float32. One object in a thousand lost shows"
     name = f"{extent.growth} spheres in our tree / in Mitsuba's"
-    yield Pair(name, lambda: (crowd("group"), crowd("sphere")), 4, other_hits, 2e-3, why)
+    yield Pair(name, partial(crowd, "group"), partial(crowd, "sphere"), 4, other_hits, 2e-3, why)
     far = {"type": "mrt_cone", "apex": [1e3, 1, 0], "base_center": [1e3, 0, 0], "radius": 0.1}
     layers = {"layers": ["depth", "normal", "albedo", "direct", "reflection", "bounces"]}
     why = "half a step of an 8-bit picture; a lamp that is left out changes hundreds"
+    nodes = mrt.scene_dict(0, **size)
     for what, change, options in (("cone code", {"far": far}, {}), ("layers", {}, layers)):
-        make = partial(left_out, mrt.scene_dict(0, **size), change, options)
-        yield Pair(f"scene 0 without {what} / with", make, 1.05, off, 0.5 / 255, why)
+        name = f"scene 0 without {what} / with"
+        whole = partial(left_out, nodes, change, options)
+        yield Pair(name, partial(_render, nodes), whole, 1.05, off, 0.5 / 255, why)
 
 
-def left_out(nodes: Nodes, change: Nodes, more: Nodes) -> tuple[Run, Run]:
-    """A scene, and the same with what its plan leaves out."""
-    return _render(nodes), _render(nodes | change, **more)
+def left_out(nodes: Nodes, change: Nodes, more: Nodes) -> Run:
+    """A render of a scene with what its plan leaves out."""
+    return _render(nodes | change, **more)
 
 
 def growth(extent: Extent) -> Iterator[Pair]:
@@ -188,14 +192,19 @@ def growth(extent: Extent) -> Iterator[Pair]:
     def longer_code(ours: Run, other: Run) -> float:
         return sum(operations(ours)) / sum(operations(other)) - 1
 
+    def pixels(n: int) -> Run:
+        return _render(mrt.scene_dict(3, width=40 * n, height=30 * n))
+
+    def lights(n: int) -> Run:
+        return _render(renders.with_lights(16 * n, **small))
+
+    def triangles(n: int) -> Run:
+        return _render(renders.with_triangles(100 * n, **small), aa=4)
+
     why = "numbers are data, not code; a loop that is unrolled makes it as many times longer"
-    for name, task, factor, goal in (  # the factor of the task, and the goal
-        ("pixels", lambda n: _render(mrt.scene_dict(3, width=40 * n, height=30 * n)), side, side * side),
-        ("lights", lambda n: _render(renders.with_lights(16 * n, **small)), times, times),
-        ("triangles", lambda n: _render(renders.with_triangles(100 * n, **small), aa=4), times, 10),
-    ):
-        make = partial(lambda task, factor: (task(factor), task(1)), task, factor)
-        yield Pair(f"{times} times the {name}", make, goal, longer_code, 0.05, why)
+    for task, factor, goal in ((pixels, side, side * side), (lights, times, times), (triangles, times, 10)):
+        name = f"{times} times the {task.__name__}"
+        yield Pair(name, partial(task, factor), partial(task, 1), goal, longer_code, 0.05, why)
 
 
 PARTS = (against_mitsuba, other_ways, growth)

@@ -13,6 +13,7 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Material
 from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.studies.speed import DIRECT
 from mrt_mitsuba.validation.tools.compare import p_values
 from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, with_materials
 from mrt_mitsuba.validation.tools.study import Study
@@ -28,7 +29,7 @@ Nodes = dict[str, Any]
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Make all comparisons with what Mitsuba brings."""
+    """Compare with Mitsuba's integrators, lights and materials."""
     for part in (direct, gloss, whole_scenes):
         part(study, quick=quick)
 
@@ -40,7 +41,6 @@ def direct(study: Study, *, quick: bool) -> None:
     surface, ours a few roundings: single pixels differ at the edges of shadows, as they do at outlines.
     """
     size: Nodes = {"width": 120, "height": 90} if quick else {"width": 320, "height": 240}
-    whitted = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
     figures = ("median difference", "share of pixels off by > 1e-5", "share of pixels that a light reaches")
     rows: list[Nodes] = []
     for number in study.each("Direct light", (0, 1, 2, 3) if quick else (0, 1, 2, 3, 4)):
@@ -52,9 +52,10 @@ def direct(study: Study, *, quick: bool) -> None:
             del nodes["sky"]  # direct would light the scene with it
             nodes["light_0"] = mrt.scene_dict(scene, flavor="stock", **size)["light_0"]
             loaded = mi.load_dict(nodes)
-            ours = mrt.render(loaded, integrator=whitted, **AT_CENTRES, layers=["depth"])
+            ours = mrt.render(loaded, integrator=DIRECT, **AT_CENTRES, layers=["depth"])
             theirs = mrt.render(loaded, integrator="direct", **AT_CENTRES).image
-            near = ~(ours.layers["depth.Z"] > NEAR) | np.isinf(ours.layers["depth.Z"])
+            depth = ours.layers["depth.Z"]
+            near = ~(depth > NEAR) | np.isinf(depth)
             error = (abs(ours.image - theirs) / (1 + theirs)).max(axis=-1)[near]
             lit = (theirs.max(axis=-1) > 0.05)[near]
             found.append((np.median(error), np.mean(error > 1e-5), lit.mean()))
@@ -63,16 +64,15 @@ def direct(study: Study, *, quick: bool) -> None:
     title = "mrt_whitted without bounces and clamp against direct: the worst of the lights"
     study.records("direct", title, rows, note)
     edges = "edges and what hides lights; measured 7 in 76,800, and 36 among the 600 spheres of scene 4"
-    why = "least fault: 1 in a million of the light"
-    difference, off, lit = figures
-    study.at_most(f"direct light: {difference}", np.max([row[difference] for row in rows]), 3e-7, why)
-    study.at_most(f"direct light: {off}", np.max([row[off] for row in rows]), 1e-3, edges)
-    least = np.min([row[lit] for row in rows])
-    study.at_least(f"direct light: {lit}", least, 0.05, "else there is nothing to compare")
+    least_fault = "least fault: 1 in a million of the light"
+    difference, off, lit = (np.array([row[name] for row in rows]) for name in figures)
+    study.at_most(f"direct light: {figures[0]}", difference.max(), 3e-7, least_fault)
+    study.at_most(f"direct light: {figures[1]}", off.max(), 1e-3, edges)
+    study.at_least(f"direct light: {figures[2]}", lit.min(), 0.05, "else there is nothing to compare")
 
 
 def gloss(study: Study, *, quick: bool) -> None:
-    """Hold the gloss of ``path``, of ever less roughness, to the mirrors of ``mrt_whitted``."""
+    """Hold ``path`` in scenes of less and less roughness to the mirrors of ``mrt_whitted``."""
     width, height, spp = (64, 48, 64) if quick else (160, 120, 512)
     path = {"type": "path", "max_depth": 8, "rr_depth": 100}
     y, x = np.mgrid[:64, :128] / 64 * np.pi
@@ -113,39 +113,25 @@ def changed(nodes: Nodes, key: str, change: Callable[[Any], Any]) -> Nodes:
     return {n: node | {key: change(node[key])} if key in node else node for n, node in nodes.items()}
 
 
-def too_bright(nodes: Nodes) -> Nodes:
-    """The nodes with colours two percent too bright."""
+def mistakes(nodes: Nodes) -> dict[str, Nodes]:
+    """The nodes with a mistake, by its name."""
 
     def brighter(color: Nodes) -> Nodes:
         return color | {"value": [1.02 * x for x in color["value"]]}
 
-    return changed(nodes, "specular_reflectance", brighter)
+    def rougher(alpha: float) -> float:
+        return 1.05 * alpha
 
+    def schlick(_: str) -> str:
+        return "schlick"
 
-def too_rough(nodes: Nodes) -> Nodes:
-    return changed(nodes, "alpha", lambda alpha: 1.05 * alpha)
-
-
-def flipped(nodes: Nodes) -> Nodes:
-    sphere = nodes["sphere_0"] | {"flip_normals": True}
-    return nodes | {"sphere_0": sphere}
-
-
-def without_a_light(nodes: Nodes) -> Nodes:
-    return {name: node for name, node in nodes.items() if name != "light_1"}
-
-
-def other_fresnel(nodes: Nodes) -> Nodes:
-    return changed(nodes, "fresnel", lambda _: "schlick")
-
-
-MISTAKES = {
-    "radiance x 1.02": too_bright,
-    "alpha x 1.05": too_rough,
-    "flipped normal of one sphere": flipped,
-    "dropped light": without_a_light,
-    "schlick for dielectric": other_fresnel,
-}
+    return {
+        "radiance x 1.02": changed(nodes, "specular_reflectance", brighter),
+        "alpha x 1.05": changed(nodes, "alpha", rougher),
+        "flipped normal of one sphere": nodes | {"sphere_0": nodes["sphere_0"] | {"flip_normals": True}},
+        "dropped light": {name: node for name, node in nodes.items() if name != "light_1"},
+        "schlick for dielectric": changed(nodes, "fresnel", schlick),
+    }
 
 
 def whole_scenes(study: Study, *, quick: bool) -> None:
@@ -155,7 +141,7 @@ def whole_scenes(study: Study, *, quick: bool) -> None:
     rows: list[Nodes] = []
 
     def renders(nodes: Nodes, seed: int) -> np.ndarray:
-        """Return RENDERS independent renders through the pixels' centres."""
+        """Independent renders through the pixels' centres, ``RENDERS`` of them."""
         scene = mi.load_dict(nodes)
         seeds = range(seed, seed + RENDERS)
         return np.array([mrt.render(scene, **options, **AT_CENTRES, seed=s).image for s in seeds])
@@ -169,7 +155,7 @@ def whole_scenes(study: Study, *, quick: bool) -> None:
         theirs = renders(stock, 1000)
         pictures = {f"scene {number}": ours}
         if number == 0:
-            pictures |= {f"scene 0, {mistake}": change(ours) for mistake, change in MISTAKES.items()}
+            pictures |= {f"scene 0, {mistake}": wrong for mistake, wrong in mistakes(ours).items()}
         why = "least fault: 2 % of the light and 5 % of alpha, as the mistakes show: they must be seen"
         for what, nodes in pictures.items():
             found = renders(nodes, 0)
