@@ -89,7 +89,7 @@ def cases(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
 
 
 def read(path: Path) -> dict[str, Row]:
-    """The rows of an earlier run. Raises ``UsageError`` for a file that is none."""
+    """The rows of an earlier run. Raises ``UsageError`` for any other file."""
     try:
         return dict(json.loads(path.read_text())["rows"])
     except (OSError, ValueError, TypeError, KeyError) as error:

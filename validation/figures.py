@@ -1,4 +1,4 @@
-"""Figures of real runs, for the documentation and for scenes of one's own."""
+"""Figures of real runs, for the documentation and for your own scenes."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class Lobe(NamedTuple):
 
 
 def lobe(wi: Sequence[Number], wo: Sequence[Number], alpha: Number) -> Lobe:
-    """The lobe for directions above the surface, whose half vector is their sum as it is."""
+    """The lobe for directions above the surface; their half vector is the sum of their components."""
     x, y, z = (number(p) + number(q) for p, q in zip(wi, wo, strict=True))
     tan2 = (x * x + y * y) / (z * z)
     d = beckmann_d(1 / mp.sqrt(1 + tan2), alpha)

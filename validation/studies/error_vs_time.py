@@ -130,8 +130,8 @@ def run(study: Study, *, quick: bool) -> None:
         where = f"{title_of(number).lower()}, {name}"
         describe(study, found, where, f"{title_of(number)}: {trade.title}", trade.truth)
         if trade.limits and not found.failed:
-            for what, *limit in trade.limits(found):
-                study.at_most(f"{where}: {what}", *limit)
+            for what, measured, most, why in trade.limits(found):
+                study.at_most(f"{where}: {what}", measured, most, why)
         del trade, found  # what holds them is freed with them
 
 

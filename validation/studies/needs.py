@@ -31,7 +31,7 @@ SCENES = range(10)
 PLANNED = "as planned"
 GENERAL = "all code and layers"
 EVERYTHING = "all code, layers and rays"
-# What is compared of each measure: where every pixel gets all rays, there is one pass instead of two
+# By measure, the way that the plan is compared with: with all rays in every pixel, one pass replaces two
 MEASURES = {"rays": EVERYTHING, "operations": EVERYTHING, "launches": GENERAL, "seconds": EVERYTHING}
 
 TITLES = {

@@ -64,7 +64,7 @@ def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
 def _found(
     look: Callable[..., Any], scene: str, settings: dict[str, Any], out: str | None, *inputs: str
 ) -> Any:
-    """Look at a scene, show what is found, and write the page into ``out``."""
+    """Examine a scene, print the findings, and write their page into ``out``."""
     if out is not None:
         prepare_folder(Path(out), inputs=inputs)
     try:

@@ -105,7 +105,7 @@ def compare(a: Picture, b: Picture, layer: str = "", *, peak: float = 1.0) -> Di
 
     Args:
         a, b: each the path of an EXR, an array [H, W] or [H, W, C], or the result of ``render``.
-        layer: a layer of an EXR or a result ("depth"), or one channel of it ("depth.Z"); the picture without.
+        layer: of an EXR or a result ("depth"), or one channel of it ("depth.Z"); by default the picture.
         peak: brightest value, for the PSNR.
 
     The p-value needs a layer "error", the standard error of each pixel, next to the picture, as
@@ -172,7 +172,7 @@ def read_layer(source: Picture, layer: str = "", name: str = "the picture") -> L
 
 
 def _layer_of(channels: Mapping[str, Array], headers: Mapping[str, Any], layer: str, name: str) -> Layer:
-    """A layer of channels by name, with what is known of its variance and window."""
+    """A layer of channels by name, with its variance and window where they are known."""
     groups: dict[str, list[str]] = {}  # channels by layer, in order
     for key in sorted(channels, key=lambda key: ((ORDER + key[-1]).index(key[-1]), key)):
         groups.setdefault(key.rpartition(".")[0] or key, []).append(key)
@@ -187,7 +187,7 @@ def _layer_of(channels: Mapping[str, Array], headers: Mapping[str, Any], layer: 
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:
-    """The probability of so much difference by noise, of the mean of channels.
+    """The probability that noise alone makes so large a difference, of the mean of channels.
 
     Uniform for equal pictures of equal noise. Means over cells are tested by the signs of differences alone,
     which is exact. How the largest difference over its deviation continues the tail of the others depends on

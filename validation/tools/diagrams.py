@@ -1,4 +1,4 @@
-"""Diagrams with lines that are labelled directly, in colours that colour-blind people can distinguish."""
+"""Diagrams with labels next to their lines, in colours that colour-blind people can distinguish."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def plain_numbers(axes: Axes) -> None:
         scale.set_minor_locator(NullLocator())
 
 
-def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float, str]], size: float = LABELS) -> None:
+def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float, str]]) -> None:
     """Write labels to the right of a plot, next to where their lines end: x, y and colour by label.
 
     Where ends are close to each other, labels move apart, and thin lines lead to them.
@@ -72,7 +72,7 @@ def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float, str]], size: f
     drawn: Any = axes.figure
     drawn.draw_without_rendering()  # places the axes
     height = axes.get_window_extent().height
-    gap = 1.35 * size * drawn.dpi / 72 / height
+    gap = 1.35 * LABELS * drawn.dpi / 72 / height
     to_axes = axes.transAxes.inverted()
     wanted = {name: to_axes.transform(axes.transData.transform(end[:2]))[1] for name, end in ends.items()}
     names = sorted(wanted, key=wanted.__getitem__)
@@ -85,7 +85,7 @@ def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float, str]], size: f
             xytext=(1.03, place),
             textcoords="axes fraction",
             color=color,
-            fontsize=size,
+            fontsize=LABELS,
             va="center",
             arrowprops=lead,
             annotation_clip=False,

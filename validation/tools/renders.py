@@ -29,7 +29,7 @@ SUPERSAMPLED: Nodes = ONE_RAY | {"aa": 4}
 Render = Callable[..., Any]
 
 
-# ----------------------------------------- Scenes of many things -----------------------------------------
+# ----------------------------------------- Scenes of many objects -----------------------------------------
 
 
 def load(nodes: Nodes) -> mi.Scene:

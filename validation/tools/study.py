@@ -1,4 +1,4 @@
-"""Validation studies: their findings, collected while they run; timing; and the report made of them.
+"""Validation studies: the findings collected while they run, timing, and the report.
 
 A study is a module with ``TITLE`` and ``run(study, *, quick)``. It states its findings through the ``Study``
 it is given. The report is a table on the terminal, ``summary.json``, CSV files, pictures and a page.
@@ -116,7 +116,7 @@ class Study:
         self.bounds.append(Bound(name, float(measured), float(limit), False, note))
 
     def goal(self, name: str, measured: float, limit: float, note: str, *, interval: Sequence[float]) -> None:
-        """Show whether a time or a ratio of times is at most so much; a busy machine must fail no study."""
+        """Show whether a time or a ratio of times is within a limit; a busy machine must fail no study."""
         self.goals.append(Bound(name, float(measured), float(limit), note=note, interval=interval))
 
     def table(
@@ -218,7 +218,7 @@ def ratio(run: Run, other: Run, *, repeats: int) -> dict[str, float]:
 
 
 def operations(render: Run) -> list[int]:
-    """The length of the code of each kernel of a ``mrt.render``, each counted once."""
+    """The length of the code of each distinct kernel of a ``mrt.render``."""
     lengths = {}  # by the hash of the code
 
     class Watch(Progress):
@@ -261,7 +261,7 @@ def terminal_table(studies: Sequence[Study]) -> str:
 def prepare_folder(folder: Path, *names: str, inputs: Sequence[str] = ()) -> None:
     """Make the folder, and find out now whether files of these names can be written there, before the work.
 
-    By default those of a report; none of them may be one of the ``inputs``. Raises ``OutputError``.
+    The names default to those of a report; no file may be one of the ``inputs``. Raises ``OutputError``.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -338,7 +338,7 @@ def _drawn(content: Any) -> Values:
 
 
 def cell(value: object) -> str:
-    """A value as people read it: floats to four digits, a dash for what is not known."""
+    """A value as people read it: floats to four digits, a dash for an unknown one."""
     if value is None or value != value:
         return "–"
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""A case of the stability study: what is measured, and why it holds to a limit or cannot."""
+"""A case of the stability study: a measured figure, with the reason for its limit or for having no limit."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ FIRST = "as first written"
 LEAST = 0.3  # roundings: as good as exact
 NONE_RIGHT = 2.0**24  # roundings: no digit is right
 OFFSET = 1e-4  # of the first t, so that a ray does not meet the surface that it leaves
-WORST = 0.99  # the share of the rays that stay below what is shown
+WORST = 0.99  # the share of the samples that stay below the figure shown
 
 Rays = tuple[Array, Array]  # origins and directions [N, 3], float32
 Curves = dict[str, Array]  # roundings [places] by ``OURS``, ``THEIRS``, ``FIRST``
@@ -64,7 +64,7 @@ def curves(axis: Axis, *, places: int, count: int) -> tuple[Array, Curves]:
 
 
 def show(study: Study, *, quick: bool, places: int = 0) -> None:
-    """Add the diagram of all axes and its table to a study, and hold ours to what is promised."""
+    """Add the diagram of all axes and its table to a study, and hold ours to its promised limit."""
     lines = {}
     rows = []
     for axis in study.each("Axes", AXES):
@@ -87,7 +87,7 @@ def show(study: Study, *, quick: bool, places: int = 0) -> None:
         rows.append(row)
     caption = (
         "Roundings of float32 (6e-8). Blue: ours. Orange: what of Mitsuba's comes nearest. Grey, dashed: the "
-        "formula as one would write it first. Dotted: what is promised of ours."
+        "formula as one would write it first. Dotted: the limit promised for ours."
     )
     for number, axis in enumerate(AXES):
         title = f"{axis.title} along the {axis.label}"
@@ -182,7 +182,7 @@ def grazing(cosine: float, count: int) -> Curves:
 
 
 def index(above: float, count: int) -> Curves:
-    """Measure Fresnel's reflectance at an index of so much above 1."""
+    """Measure Fresnel's reflectance at an index of refraction, given as its excess over 1."""
     n = np.float32(1 + above)
     c = np.linspace(0.02, 1, count, dtype=np.float32)
     truth = [float(exact.fresnel_dielectric(cosine, 1, n)) for cosine in c]
@@ -240,7 +240,7 @@ def _quadratic(a: Array, b: Array, c: Array, holds: Callable[[Array], Array] = n
 
 
 def ball(count: int, *, scale: float = 1.0, far: float = 3.0) -> Curves:
-    """Measure hits of a ball of a scale seen from so many radii."""
+    """Measure hits of a ball of radius ``scale``, seen from ``far`` radii away."""
     rng = np.random.default_rng(5)
     eyes = unit(rng.normal(size=(count, 3))) * scale * far
     across = unit(np.cross(eyes, rng.normal(size=(count, 3)))) * scale
@@ -257,7 +257,7 @@ def ball(count: int, *, scale: float = 1.0, far: float = 3.0) -> Curves:
 
 
 def floor(far: float, count: int) -> Curves:
-    """Measure where rays meet a floor, so many heights of the eye away."""
+    """Measure hits of a floor at a distance, in heights of the eye."""
     rng = np.random.default_rng(6)
     normal = np.array([0.6, 0.64, 0.48])
     up = unit(np.float32(normal).astype(np.float64))
@@ -273,7 +273,7 @@ def floor(far: float, count: int) -> Curves:
 
 
 def axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curves:
-    """Measure hits on the side of a thing, so many radii high, on an axis aslant; its larger extent is 1.
+    """Measure hits on the side of a solid ``slender`` radii high, on a slanted axis; its larger extent is 1.
 
     At a depth below the tip its radius is ``wide + slope * depth``.
     """

@@ -64,7 +64,7 @@ def blurs() -> Iterator[Case]:
     yield Case("huge ranges, blur", what, "means are finite", np.sum(~np.isfinite(found)), 0)
 
 
-def _marks(name: str, image: Array, depth: Array) -> filters.Edges:
+def _marks(name: str, image: Array, depth: Array) -> filters.EdgeMap:
     """What a detector finds in a picture, or the one that looks at the geometry in the depth."""
     if name == "geometry":
         return filters.geometry_edges(np.full_like(image, 3**-0.5), depth)

@@ -56,7 +56,7 @@ def scaled(factor: float) -> Place:
 
 
 def moved(sizes: float) -> Place:
-    """A place so many scene sizes away, of which too many leave no digits for the scene."""
+    """A place a number of scene sizes away; very far away, float32 has no digits left for the scene."""
     step = sizes * 2**-23
     why = f"coordinates have steps of {step:.0e} scene sizes there: normals and outlines move"
     most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
@@ -112,7 +112,7 @@ def solids(size: float) -> Values:
 
 
 def ends(size: float) -> tuple[Point, Point]:
-    """The ends of an axis aslant."""
+    """The ends of a slanted axis."""
     return (0.1 * size, 0.6 * size, -0.2 * size), (-0.1 * size, -0.4 * size, 0.2 * size)
 
 
@@ -208,7 +208,7 @@ def measure(kind: str, size: float, count: int) -> list[float]:
 
 
 def lit(kind: str, thing: Any, light: Sequence[float]) -> Values:
-    """The nodes of a scene of a thing, of a kind as in ``solids``, under a light."""
+    """The nodes of a scene with one solid, of a kind of ``solids``, under a light."""
     x, y, z = light
     camera = Camera((0, 0, 9), (0, 0, 0))
     things: Values = {kind: (thing,)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from typing import Any
 
@@ -176,7 +176,7 @@ def lobes_with_truth(count: int) -> Arrays:
     return pairs | {"steepness": steepness[keep]} | dict(zip(TRUTH, truth.T, strict=True))
 
 
-def _exact(wi: np.ndarray, wo: np.ndarray, alpha: float, ior: float) -> list[float]:
+def _exact(wi: Sequence[float], wo: Sequence[float], alpha: float, ior: float) -> list[float]:
     """The values of ``TRUTH`` for a pair of directions."""
     a = exact.number(alpha)
     step = a * exact.mpf("1e-20")

@@ -63,7 +63,7 @@ def _lit(position: tuple[float, float, float], color: float = 1.0) -> Scene:
 
 
 def _under(outwards: float) -> Scene:
-    """A light on the lower side of the ball, or so many radii outside, and the floor that it lights."""
+    """A light on the lower side of the ball, or ``outwards`` radii off it, and the floor that it lights."""
     x, y, z = ((1 + outwards) * 0.5 * c for c in (0.26726124, -0.53452248, 0.80178373))
     return replace(_lit((x, 0.5 + y, z)), camera=Camera((1.5, 1.5, 3.0), (0.3, 0.0, 0.6)))
 
