@@ -56,22 +56,24 @@ def crowded(size, ps, time, u):
     return put(ps, p=mi.Point3f(2 * u.x ** (1 + size) - 1, ps.p.y, 0))
 
 
+def around_z(size, v):
+    """Vectors turned around z, to crowd at one azimuth."""
+    turn = dr.atan2(v.y, v.x) / (2 * dr.pi) + 0.5
+    azimuth = 2 * dr.pi * turn ** (1 + size)
+    radius = dr.hypot(v.x, v.y)
+    return mi.Vector3f(radius * dr.cos(azimuth), radius * dr.sin(azimuth), v.z)
+
+
 def crowded_azimuth(size, ps, time, u):
     """Positions on a unit sphere, crowded to one azimuth."""
-    azimuth = 2 * dr.pi * u.y ** (1 + size)
-    radius = dr.hypot(ps.p.x, ps.p.y)
-    p = mi.Point3f(radius * dr.cos(azimuth), radius * dr.sin(azimuth), ps.p.z)
-    return put(ps, p=p, n=mi.Normal3f(p))
+    p = around_z(size, ps.p)
+    return put(ps, p=mi.Point3f(p), n=mi.Normal3f(p))
 
 
 def crowded_directions(size, ds, it, u):
     """Directions turned around the one to the middle, to crowd at one azimuth."""
     frame = mi.Frame3f(dr.normalize(-mi.Vector3f(it.p)))
-    local = frame.to_local(ds.d)
-    turn = dr.atan2(local.y, local.x) / (2 * dr.pi) + 0.5
-    azimuth = 2 * dr.pi * turn ** (1 + size)
-    radius = dr.hypot(local.x, local.y)
-    d = frame.to_world(mi.Vector3f(radius * dr.cos(azimuth), radius * dr.sin(azimuth), local.z))
+    d = frame.to_world(around_z(size, frame.to_local(ds.d)))
     return put(ds, d=d, p=it.p + ds.dist * d)
 
 

@@ -153,7 +153,7 @@ def changed_sky(changes):
 
 
 def _faulty_bsdf(fault, changes):
-    """Several may be in use: each goes by a name. Needs ``register``."""
+    """The dict of a BSDF with the fault; several may be in use, each under a name. Needs ``register``."""
     nested = fault.nested or {"type": "diffuse"}
     ((kind, change),) = changes.items()
     name = f"{fault.what} {change.args[0]}"
@@ -223,7 +223,7 @@ class Markdown(str):
 
 def statements() -> Markdown:
     """A table of all laws, by the first lines of their docstrings."""
-    lines = ["| of a | law | says |", "|---|---|---|"]
+    lines = ["| plugin | law | states |", "|---|---|---|"]
     for name, kind in KINDS.items():
         for law in kind.laws.values():
             words = str(law.__doc__).splitlines()[0].replace("``", "`").replace("|", "\\|")
@@ -239,7 +239,7 @@ def stated() -> Markdown:
     return Markdown("\n".join([HEAD, *rows]))
 
 
-HEAD = "| of a | law | finds | quick | full |\n|---|---|---|---|---|"
+HEAD = "| plugin | law | fault | quick | full |\n|---|---|---|---|---|"
 
 
 def row(name: str, fault: Fault, *least: float) -> str:
