@@ -7,6 +7,7 @@ import contextlib
 import logging
 import sys
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -85,7 +86,9 @@ class TerminalProgress(Progress):
         if not bars:
             yield _ignore
             return
-        from tqdm.auto import tqdm
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "IProgress not found")  # then bars are text
+            from tqdm.auto import tqdm
 
         looks: Any = {"unit": self.unit, "unit_scale": True, "dynamic_ncols": True, "leave": False}
         with tqdm(total=total, desc=title, postfix=on_bar or None, file=self.bar_file, **looks) as bar:
@@ -98,16 +101,30 @@ class NotebookProgress(TerminalProgress):
     shows_rounds = True
 
     _display: Any = None  # IPython's handle of the picture
+    _picture = ""  # after the last round, as HTML
 
     def round(self, picture: RoundPicture) -> None:
-        from IPython.display import HTML, display
-
         from mrt_mitsuba.output.files import png
 
         encoded = base64.b64encode(png(picture.image)).decode()
         target = "" if picture.target is None else f" (target {picture.target:.2g})"
         caption = f"error {picture.rmse:.2g}{target}, {picture.spp:.0f} rays a pixel, {picture.seconds:.1f} s"
-        shown = HTML(f'<img src="data:image/png;base64,{encoded}" alt="{caption}"><br>{caption}')
+        self._picture = f'<img src="data:image/png;base64,{encoded}" alt="{caption}">'
+        self._show(caption)
+
+    @contextlib.contextmanager
+    def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
+        if title == ROUNDS and self._picture:
+            self._show(message)  # in place of a bar
+            yield _ignore
+            return
+        with super().stage(title, total, message) as advance:
+            yield advance
+
+    def _show(self, caption: str) -> None:
+        from IPython.display import HTML, display
+
+        shown = HTML(f"{self._picture}<br>{caption}")
         if self._display is None:
             self._display = display(shown, display_id=True)
         else:

@@ -195,4 +195,4 @@ def _message(done: list[Round], target: float | None, more: float) -> str:
         aim = f" → {target:.2g}"
         seconds = now.seconds * max(min(now.rmse / target, 1e6) ** 2 - 1, 0)  # squares fall as time goes by
         left = f", about {seconds:.0f} s left" if seconds < 1e6 else ""
-    return f"error {now.rmse:.2g}{aim}, {now.seconds:.0f} s{left}, {more:.1f} rays a pixel more"
+    return f"error {now.rmse:.2g}{aim}{left}, {now.spp:.0f} rays a pixel, now {more:.0f} more"

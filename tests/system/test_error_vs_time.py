@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from nodes import rgb, sensor
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
 from mrt_mitsuba.output.files import write_exr
+from mrt_mitsuba.validation.tools import work_precision
 from mrt_mitsuba.validation.tools.work_precision import Findings, Point
 
 for needed in ("matplotlib", "jinja2", "scipy", "flip_evaluator"):
@@ -59,6 +61,22 @@ def test_errors_fall_as_theory_says_and_a_bias_is_found(scene):
     assert few.cold > 0
     assert few.rays["primary"] == 4 * SIZE[0] * SIZE[1]
     assert "<iframe" in found._repr_html_()
+
+
+@pytest.mark.parametrize(("seconds", "renders"), [(0.02, 3), (0.026, 2), (0.06, 1)])
+def test_a_timing_takes_fifty_milliseconds(seconds, renders, scene, monkeypatch):
+    calls = []
+
+    def render(*args, **options):
+        result = mrt.render(*args, **options)
+        calls.append(options["seed"])
+        return replace(result, timings=replace(result.timings, total=seconds, load=0.0))
+
+    monkeypatch.setattr(work_precision, "render", render)
+    truth = np.ones((*SIZE[::-1], 3))
+    found = mrt.error_vs_time(scene, {"path": path(1)}, reference=truth, shared=ONE_RAY, repeats=2)
+    assert calls == [0, 0, *[0] * renders, *[1] * renders]  # a cold and a warm run, then two repeats
+    assert found.points["path"].seconds == pytest.approx(seconds)
 
 
 def test_nothing_is_claimed_below_the_reference(scene):

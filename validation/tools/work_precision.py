@@ -29,6 +29,7 @@ from mrt_mitsuba.validation.tools.compare import Array, Difference, compare, rea
 from mrt_mitsuba.validation.tools.study import Study, Values, notebook, save_report
 
 TITLE = "Error against time"
+LEAST = 0.05  # seconds that one timing takes: a shorter render is repeated, and the mean counts
 REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
 RESOLVED = 2.0  # an error is known from this many times the reference's own error on
 ERRORS = 4  # that the time is given for, unless they are chosen
@@ -40,6 +41,14 @@ Options = Mapping[str, Any]
 Given = Any  # a scene, as ``render`` takes it, or a reference
 Run = Callable[[Options, int], Result]  # a render with options and a seed
 Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """A render and its time."""
+
+    result: Result
+    seconds: float  #: without loading the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +288,8 @@ def error_vs_time(
             ``aa`` less by one is compared. Two sets of options, the better first: what they differ by bounds
             the error of the first. Or a picture: an array, the path of an EXR or a ``Result``, whose error is
             read from its layer "error".
-        repeats: with other seeds, in turn, after a cold and a warm run of each case.
+        repeats: with other seeds, in turn, after a cold and a warm run of each case. A render of less than
+            0.05 s is timed as the mean of several.
         shared: options of all cases and of the reference.
         errors: RMSEs to give the time for; by default four over the range that was measured.
         cold: whether the kernels of each case are compiled anew for its first run, which takes longer.
@@ -309,7 +319,7 @@ def error_vs_time(
         inside = np.geomspace(max(known), min(known), ERRORS + 2)[1:-1]
         errors = list(dict.fromkeys(float(f"{1.05 * e:.1e}") for e in inside))
     return Findings(
-        scene=next((found[0].plan.scene for found in runs.values()), "scene"),
+        scene=next((found[0].result.plan.scene for found in runs.values()), "scene"),
         points=points,
         failed=failed,
         reference=np.mean(halves, axis=0),
@@ -371,7 +381,7 @@ def _picture(result: Result) -> Array:
 
 def _measure(
     run: Run, cases: Mapping[str, Options], truth: Array, repeats: int, cold: bool, progress: Progress
-) -> tuple[dict[str, list[Result]], dict[str, str]]:
+) -> tuple[dict[str, list[Timed]], dict[str, str]]:
     """The results of cases, of which the last ``repeats`` count, and why others failed.
 
     Each runs first, perhaps with its kernels compiled anew and once more, then ``repeats`` times in turn, so
@@ -380,7 +390,7 @@ def _measure(
     import drjit as dr
 
     failed: dict[str, str] = {}
-    runs: dict[str, list[Result]] = {name: [] for name in cases}
+    runs: dict[str, list[Timed]] = {name: [] for name in cases}
     first = -2 if cold else -1
     with progress.stage(TITLE, len(cases) * (repeats - first)) as advance:
         for turn in range(first, repeats):
@@ -388,8 +398,9 @@ def _measure(
                 try:
                     if cold and turn == first:
                         dr.flush_kernel_cache()
-                    runs[name].append(run(cases[name], max(turn, 0)))
-                    compare(_picture(runs[name][-1]), truth)  # raises for another size
+                    timed = _timed(run, cases[name], max(turn, 0), LEAST if turn >= 0 else 0.0)
+                    compare(_picture(timed.result), truth)  # raises for another size
+                    runs[name].append(timed)
                 except Exception as error:
                     failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
                     del runs[name]
@@ -397,22 +408,31 @@ def _measure(
     return runs, failed
 
 
+def _timed(run: Run, options: Options, seed: int, least: float) -> Timed:
+    """Render once, or again until the renders take ``least`` seconds together."""
+    seconds: list[float] = []
+    while not seconds or sum(seconds) < least:
+        result = run(options, seed)
+        seconds.append(result.timings.total - result.timings.load)
+    return Timed(result, float(np.mean(seconds)))
+
+
 def _point(
-    name: str, runs: Sequence[Result], repeats: int, halves: Sequence[Array], own_error: float
+    name: str, runs: Sequence[Timed], repeats: int, halves: Sequence[Array], own_error: float
 ) -> Point:
     """The figures of a case; its first run was cold, its last ``repeats`` count."""
-    counted = runs[-repeats:]
+    counted = [timed.result for timed in runs[-repeats:]]
     image = counted[0].image
     pictures = np.array([result.image for result in counted], np.float64)  # [repeats, H, W, 3]
     errors = [(pictures - half).reshape(len(pictures), -1) for half in halves]
     gram = errors[0] @ errors[1].T / errors[0].shape[1]
-    seconds = np.array([result.timings.total - result.timings.load for result in runs])
+    seconds = np.array([timed.seconds for timed in runs])
     return Point.of(
         name,
         seconds[-repeats:],
         (gram + gram.T) / 2,
         cold=float(seconds[0]),
-        compile=runs[0].timings.compile,
+        compile=runs[0].result.timings.compile,
         rays=dict(counted[0].rays),
         image=image,
         difference=compare(image, np.mean(halves, axis=0)),
