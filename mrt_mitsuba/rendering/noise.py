@@ -64,6 +64,11 @@ class Forecast:
         """Is the noise in so many pixels that a few rays of each show it?"""
         return self.noisy > EVENLY and self.tail < SUSPECT
 
+    @property
+    def rare(self) -> bool:
+        """Is it in few pixels, and perhaps ruled by rare rays?"""
+        return self.noisy <= EVENLY and self.tail >= SUSPECT
+
 
 @dataclass(frozen=True)
 class Sums:
@@ -396,7 +401,8 @@ class RayNoise:
             mixed[quiet & also] = 0
         if near is None:
             near = _nearby(differences(first, second), WINDOWS[3:])
-        ratio = self.film.even * _ratios(near) + self._uneven(state)
+        found, expected = np.moveaxis(near, -3, 0)
+        ratio = self.film.even * found / np.maximum(expected, 1e-30) + self._uneven(state)
         return np.asarray(mixed * ratio * np.float32(self.film.averaging * state.unit))
 
     def _uneven(self, state: State) -> float:
@@ -442,62 +448,34 @@ class RayNoise:
         return np.stack([half, half, scouts, scouts])
 
     def last_shares(self, state: State, most: float, target: float | None) -> np.ndarray:
-        """What a half takes in a field is corrected by pixels of the others, so that no value moves its own
-        weight; under a filter no pixel can do so."""
+        """How much less a sequence errs, the halves show best: in pixels of the other colour of a chessboard,
+        so that no value moves its own weight."""
         room = self._room(state, most) / 2
         rounding = self._rounding(state)
         scouts = state.sums(*SCOUTS)
         alone = len(self._fields) == 1
         near = None if alone else np.stack([_nearby(state.differing * ~f, WINDOWS[2:]) for f in self._fields])
+        # of a ray's variance in the squares of the halves' difference
+        weight = np.float32((1 / state.rays[HALVES]).sum(0) / (4 * state.unit))
         chosen = np.zeros((4, self.film.pixels), np.int64)
         for index in HALVES:
             have = state.rays[index]
-            found = self._variance_of_rays(state, state.sums(1 - index), scouts, near)
-            if near is None:
-                deviation = _smoothed(found)
+            views = self._variance_of_rays(state, state.sums(1 - index), scouts, near)
+            for field, variance in zip(self._fields, views.reshape(-1, *self.film.shape), strict=True):
+                gain = 0.0
+                if near is not None:
+                    errors = _calibrated(variance * weight, state.differing[0], ~field)
+                    drawn = _drawn(errors[~field], state.differing[0][~field])
+                    variance = errors * drawn / weight
+                    gain = self._gain(state, ~field)
+                deviation = _smoothed(variance)
+                part = room * field.mean()
                 factor = math.inf
                 if target is not None:
-                    factor = _factor(deviation, found, have, room, 2 * target**2)
-                chosen[index] = self._share(have, deviation, room, rounding, factor)
-                continue
-            for field, less, variance in zip(self._fields, _ratios(near), found, strict=True):
-                deviation, factor = self._by_others(state, index, ~field, variance, less, room, target)
-                part = room * field.mean()
+                    some = deviation[field], variance[field], have[field]
+                    factor = _factor(*some, part, 2 * target**2, gain)
                 chosen[index] += self._share(have, deviation, part, rounding, factor, field)
         return chosen
-
-    def _by_others(
-        self,
-        state: State,
-        index: int,
-        others: np.ndarray,
-        variance: np.ndarray,
-        less: np.ndarray,
-        room: float,
-        target: float | None,
-    ) -> tuple[np.ndarray, float]:
-        """Deviations of a ray, [H, W], and by what to multiply them for the rays of a half, as pixels of the
-        other fields have it.
-
-        A pixel that is taken for noisy by chance gets many rays, and seems to be left little noise. So the
-        rays of the half itself, which do not decide the shares of their pixels, tell what these leave there.
-        ``variance``: of rays, by the other pictures; ``less``: by what a sequence divides it; [H, W].
-        """
-        errors = state.differing[0]
-        # of a ray's variance in these squares
-        weight = np.float32((1 / state.rays[HALVES]).sum(0) / (4 * state.unit))
-        deviation = _smoothed(_calibrated(variance * weight, errors, others) / weight)
-        if target is None:
-            return deviation, math.inf
-        own = state.sums(index).variance * less * np.float32(state.unit)
-        expected = state.differing[1] * less
-        own *= _calibrated(expected, errors, others) / np.maximum(expected, 1e-30)
-        own = own[others] * _drawn((own * weight)[others], errors[others])
-        gain = self._gain(state, others)
-        part = room * others.mean()
-        return deviation, _factor(
-            deviation[others], own, state.rays[index][others], part, 2 * target**2, gain
-        )
 
     def _gain(self, state: State, among: np.ndarray) -> float:
         """By what power of the rays, beyond the first, variance falls in some pixels [H, W]: as it fell since
@@ -599,11 +577,6 @@ def number_of(values: np.ndarray) -> float:
 def _smoothed(variance: np.ndarray) -> np.ndarray:
     """Deviations around each pixel, [H, W]: those of single pixels are known badly."""
     return window_means(np.sqrt(variance + 1e-30), 1)
-
-
-def _ratios(near: np.ndarray) -> np.ndarray:
-    """By what a sequence divides the variance, given ``differences`` around pixels [..., 2, H, W]."""
-    return np.asarray(near[..., 0, :, :] / np.maximum(near[..., 1, :, :], 1e-30))
 
 
 def _nearby(values: np.ndarray, widths: Sequence[int]) -> np.ndarray:

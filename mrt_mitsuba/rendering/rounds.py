@@ -14,7 +14,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import warn
 from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, Round, RoundPicture
-from mrt_mitsuba.rendering.noise import SUSPECT, estimate
+from mrt_mitsuba.rendering.noise import estimate
 from mrt_mitsuba.rendering.progress import Advance
 from mrt_mitsuba.target import Goal
 
@@ -30,7 +30,7 @@ MORE = 2  # times the rays are doubled where the tail of their values is in doub
 EVEN = 0.25  # of the mean deviation is the least that a pixel is given rays for, until there are as many
 SHY = 0.85  # of the rays that a target seems to want, until there are as many
 NEAR = 1.05  # times a target is an error that reaches it, as far as it is known
-CONFIRMED = 1.15  # times the rays there are may be missing, where rare rays may rule
+RARE = 0.85  # of the target is aimed at where rare rays may rule: some of them are not met yet
 LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
 OnRound = Callable[[RoundPicture], object]
@@ -85,7 +85,7 @@ def run_rounds(noise: Noise, stage: Stage, goal: Goal, on_round: OnRound | None 
             most = min(most, now.spp * goal.seconds / now.seconds)
         if most < LEAST_GROWTH * now.spp:
             break
-        following = _next(noise, state, now.spp, most, goal.most, target, following.doubled)
+        following = _next(noise, state, now.spp, most, goal.most, target, following)
     error = replace(estimate(noise, state), target=target)
     found = [state.unfit_rays(), _doubt(error), "" if stopped else _missed(goal, now, error)]
     if any(found):
@@ -94,36 +94,34 @@ def run_rounds(noise: Noise, stage: Stage, goal: Goal, on_round: OnRound | None 
 
 
 def _next(
-    noise: Noise, state: State, spp: float, most: float, rays: float, target: float | None, doubled: int
+    noise: Noise, state: State, spp: float, most: float, rays: float, target: float | None, before: Next
 ) -> Next:
     """What to trace after ``spp`` rays a pixel, of which there may be ``most`` after the next round, and
     ``rays`` in the end."""
     if target is None and most >= rays:
         return Next(noise.last_shares(state, rays, None), last=True)
     forecast = noise.forecast(state)
-    aim = None if target is None else noise.margin * max(target, 1e-100)
+    margin = noise.margin * (RARE if forecast.rare else 1)
+    aim = None if target is None else margin * max(target, 1e-100)
     wanted = rays if aim is None else noise.wanted(state, forecast, aim)
     least = 0.0 if aim is None else _least(noise, forecast, rays)
     even = 0.0
+    doubled = before.doubled
     if spp < 0.9 * least:  # shares are rounded
         most = min(most, max(least, SHY * wanted))
         aim = None
         even = EVEN
     elif target is not None and forecast.rmse <= target:
-        if (
-            forecast.tail <= DOUBTFUL or doubled == MORE
-        ):  # the halves know better what is missing, if anything
+        if forecast.tail <= DOUBTFUL or doubled == MORE:  # the halves know what is missing, if anything
             return Next(noise.last_shares(state, most, aim), last=True)
-        doubled += 1
         most = min(most, 2 * spp)
+        doubled += 1
         aim = None
     elif wanted <= most:
-        if forecast.tail < SUSPECT or wanted < CONFIRMED * spp:
-            return Next(noise.last_shares(state, rays, aim), last=True)
-        most = wanted  # where rare rays may rule, scouts have to confirm it
+        return Next(noise.last_shares(state, rays, aim), last=True)
     if most >= rays:
         return Next(noise.last_shares(state, rays, aim), last=True)
-    return Next(noise.shares(state, forecast, most, even), last=False, doubled=doubled)
+    return Next(noise.shares(state, forecast, most, even), False, doubled)
 
 
 def _least(noise: Noise, forecast: Forecast, rays: float) -> float:
