@@ -30,7 +30,7 @@ MORE = 2  # times the rays are doubled where the tail of their values is in doub
 EVEN = 0.25  # of the mean deviation is the least that a pixel is given rays for, until there are as many
 SHY = 0.85  # of the rays that a target seems to want, until there are as many
 NEAR = 1.05  # times a target is an error that reaches it, as far as it is known
-RARE = 0.85  # of the target is aimed at where rare rays may rule: some of them are not met yet
+RARE = 0.92  # of the target is aimed at where rare rays may rule: some of them are not met yet
 LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
 
 OnRound = Callable[[RoundPicture], object]
