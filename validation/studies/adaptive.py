@@ -206,8 +206,8 @@ def rays_alone(study: Study, size: int, rays: int, *, turns: int) -> None:
             row[f"{rfilter}: over"] = row[f"{rfilter}: a ray"] / row[f"{rfilter}: path"]
         rows.append(row)
     note = (
-        "aamode=noise over multijitter. Path: the time of a ray in its kernel over that of rays that go to all "
-        "pixels alike; rays to glass take longer paths than rays to the sky. Over: a ray over its path."
+        "aamode=noise over multijitter. Path: the time of a ray in its kernel over that of rays that go to "
+        "all pixels alike; rays to glass take longer paths than rays to the sky. Over: a ray over its path."
     )
     study.records(f"ray-{size}", f"{rays} rays a pixel, {size}x{size}", rows, note)
     costs = [row[f"{rfilter}: over"] for row in rows for rfilter in ("box", "gaussian")]
