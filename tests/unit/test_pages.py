@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 
@@ -80,3 +81,11 @@ def test_code_that_pages_include_fits_too() -> None:
     assert included
     for path in included:
         assert [line for line in path.read_text().splitlines() if len(line) > COLUMNS] == [], path
+
+
+def test_what_the_page_of_the_api_names_is_there() -> None:
+    """A name that moved would only be noticed when the site is built."""
+    names = re.findall(r"auto(?:class|function):: ([\w.]+)\.(\w+)", (DOCS / "api.rst").read_text())
+    assert len(names) > 20
+    for module, name in names:
+        assert hasattr(importlib.import_module(module), name), f"{module}.{name}"
