@@ -89,7 +89,15 @@ def _calm(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("half", [0, 1])
 @pytest.mark.parametrize("color", [0, 1])
-@pytest.mark.parametrize("goal", [{"rays": 64}, {"rays": 512}, {"target": 0.05, "rays": 2000}])
+@pytest.mark.parametrize(
+    "goal",
+    [
+        {"rays": 64},
+        {"rays": 512},
+        {"target": 0.05, "rays": 2000},
+        {"target": "2%", "rays": 9000},  # of a luminance that no half decides, either
+    ],
+)
 def test_no_value_decides_its_weight_nor_when_to_stop(half, color, goal):
     """Other values of one half, in pixels of one colour of a chessboard, change nothing of how many rays it
     gets there: so its mean is right."""
