@@ -29,30 +29,36 @@ class Draws:
 
     names = ("R", "G", "B")
 
-    def __init__(self, draw: Draw, other: int = -1, draw_other: Draw | None = None) -> None:
+    def __init__(
+        self, draw: Draw, other: int = -1, draw_other: Draw | None = None, rfilter: str = "box"
+    ) -> None:
         import mitsuba as mi
 
         mrt.register()
-        film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}}
+        film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": rfilter}}
         self.film = Film(mi.load_dict({"type": "perspective", "film": film}))
         self.draws = [draw_other or draw if picture == other else draw for picture in range(4)]
 
     def expose(self, groups: Any, starts: Any, *, pictures: int, **_: Any) -> Any:
         seed = starts.seed
-        shape = (pictures, SIDE, SIDE)
-        rays = groups.rays_of(pictures * PIXELS).reshape(pictures, PIXELS)
-        before = np.zeros((pictures, PIXELS), np.int64)
+        shape = (pictures, *self.film.shape)
+        pixels = self.film.pixels
+        rays = groups.rays_of(pictures * pixels).reshape(pictures, pixels)
+        before = np.zeros((pictures, pixels), np.int64)
         before.ravel()[groups.pixels] = groups.first
-        total, square, peak = np.zeros((3, pictures, PIXELS))
+        total, square, peak = np.zeros((3, pictures, pixels))
         for picture, draw in enumerate(self.draws):
             rng = np.random.default_rng((seed, picture, int(before[picture].sum())))
-            pixel = np.repeat(np.arange(PIXELS), rays[picture])
+            pixel = np.repeat(np.arange(pixels), rays[picture])
             values = draw(rng, pixel)
-            total[picture] = np.bincount(pixel, values, PIXELS)
-            square[picture] = np.bincount(pixel, values**2, PIXELS)
+            total[picture] = np.bincount(pixel, values, pixels)
+            square[picture] = np.bincount(pixel, values**2, pixels)
             np.fmax.at(peak[picture], pixel, values)
         total, square = (np.repeat(v.reshape(1, *shape), 3, axis=0) for v in (total, square))
         sums = total / np.maximum(rays, 1).reshape(shape)
+        if self.film.reach:  # which averages noise, half of what changes within a pixel, too
+            mean = sums.mean((-2, -1), keepdims=True)
+            sums = mean + (sums - mean) * (self.film.averaging * (1 + self.film.even) / 2) ** 0.5
         weights = (rays > 0).reshape(shape).astype(float)
         peak = peak.reshape(shape)
         return SimpleNamespace(sums=sums, weights=weights, rays=rays, total=total, square=square, peak=peak)
@@ -66,7 +72,7 @@ def _render(exposer: Draws, seed: int = 0, target: Any = None, rays: int = 64, o
     return SimpleNamespace(
         rounds=rounds,
         error=error,
-        rays=state.rays.reshape(4, PIXELS)[:2],
+        rays=state.rays.reshape(4, -1)[:2],
         image=state.image(),
         map=np.sqrt(noise.variance(state).mean(-1)),
         samples=state.samples(),
@@ -151,6 +157,24 @@ def test_no_value_decides_by_how_much_a_sequence_gains(half, color):
     assert plain.rounds[-1].spp > 1.5 * plain.rounds[-2].spp  # a last round that is not empty
     assert 0.75 * 0.002 < plain.error.rmse < 0.002
     assert_array_equal(changed.rays[half][there], plain.rays[half][there])
+
+
+@pytest.mark.parametrize("half", [0, 1])
+@pytest.mark.parametrize("goal", [{"rays": 64}, {"target": 0.05, "rays": 2000}])
+def test_under_a_filter_no_value_decides_its_weight(half, goal):
+    """Other values of one half change nothing of how many rays it gets, in any pixel."""
+
+    def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
+        calm = _calm(rng, pixel)
+        return np.where(pixel % 3, _rare(0.05)(rng, pixel), calm)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mrt.MrtWarning)
+        plain = _render(Draws(_calm, rfilter="gaussian"), **goal)
+        changed = _render(Draws(_calm, half, draw, rfilter="gaussian"), **goal)
+    assert changed.image.mean() > 1.5 * plain.image.mean()
+    assert_array_equal(changed.rays[half], plain.rays[half])
+    assert (changed.rays[1 - half] != plain.rays[1 - half]).any()  # it decides for the other in the end
 
 
 def test_rare_bright_values_keep_their_share():
