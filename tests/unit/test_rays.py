@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mrt_mitsuba.filters.grid import dilated, window_means
 from mrt_mitsuba.rays.film import divide
+from mrt_mitsuba.rendering.exposing import Groups
 
 LARGEST = 2**32 - 1
 
@@ -55,3 +56,21 @@ def test_rays_beyond_32_bits_get_numbers_of_their_own():
         seen.append(np.array(sampler.next_1d()))
     assert (seen[0] != seen[1]).all()
     assert (seen[1] != seen[2]).all()
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("most", [1, 2, 4, 7, 100])
+def test_however_groups_are_cut_each_ray_is_traced_once(most):
+    """Also where a pixel has more groups than a wavefront takes, and has had rays before."""
+    counts = np.array([[0, 5, 1, 0, 9, 3]])
+    before = np.array([[0, 4, 0, 0, 8, 2]])
+    pixels = np.repeat(np.arange(6), 2 * counts[0])
+    numbers = np.concatenate([b + np.arange(2 * n) for b, n in zip(before[0], counts[0], strict=True)])
+    traced = []
+    done = 0
+    for _, some in Groups.shared_out(2, counts, before).parts(most, 3):
+        assert some.count <= most
+        assert some.before == done
+        done += some.count
+        traced.append(np.stack([np.array(lane) for lane in some.lanes()]))
+    assert_array_equal(np.concatenate(traced, 1), [pixels, numbers])
