@@ -12,8 +12,10 @@ import pytest
 from PIL import Image
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.command.main import main
+from mrt_mitsuba.command.options import TABLE
 from mrt_mitsuba.scene.export import FLAVORS, write_xml
-from mrt_mitsuba.scene.model import Camera, Cylinder
+from mrt_mitsuba.scene.model import MODEL_OPTIONS, Camera, Cylinder
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.scenes_xml import NUMBERS, path
 
@@ -134,3 +136,50 @@ def test_an_obj_file_is_exported_as_it_renders(tmp_path):
     assert [Path(file).name for file in written] == ["t_mesh_0.ply", "t.xml"]
     before = mrt.render(tmp_path / "t.obj", aa=1, **view)
     assert np.array_equal(before.image, mrt.render(written[1], aa=1, lattice="report").image)
+
+
+USED = {"width": "8", "height": "6", "fresnel": "dielectric"}
+IDLE = {
+    "aa": "2",
+    "aamode": "none",
+    "maxspp": "64",
+    "maxseconds": "1",
+    "lattice": "centered",
+    "focaldist": "2",
+    "focalrange": "1",
+    "dof": "report",
+    "layers": "depth",
+    "motion": "0,0,1",
+    "variant": "scalar_rgb",
+    "memory": "4G",
+    "seed": "1",
+    "sensor": "0",
+    "spp": "16",
+    "format": "png",
+    "tonemap": "srgb",
+    "plan": "show",
+    "quiet": "1",
+    "log": "info",
+    "target": "0.01",
+}
+OTHERS = {"scene", "motionsamples", "motionmode"}  # a path, and what needs another option
+
+
+def test_the_cases_of_export_are_all_options():
+    of_models = {name for name in TABLE if name in MODEL_OPTIONS} - {"target"}
+    assert set(TABLE) == {*USED, *IDLE, *OTHERS, *of_models}
+
+
+@pytest.mark.parametrize("name", IDLE)
+def test_export_refuses_what_it_has_no_use_for(tmp_path, capfd, name):
+    place = tmp_path / "a.xml"
+    assert main(["export", "3", "--xml", str(place), f"{name}={IDLE[name]}"]) == 2
+    assert f"{name} is of no use to mrt export" in capfd.readouterr().err
+    assert not place.exists()
+
+
+@pytest.mark.parametrize("name", USED)
+def test_export_uses_what_it_takes(tmp_path, name):
+    assert main(["export", "3", "--xml", str(tmp_path / "a.xml")]) == 0
+    assert main(["export", "3", "--xml", str(tmp_path / "b.xml"), f"{name}={USED[name]}"]) == 0
+    assert (tmp_path / "a.xml").read_text() != (tmp_path / "b.xml").read_text()
