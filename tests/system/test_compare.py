@@ -263,3 +263,44 @@ def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch):
     ):
         mrt.compare(picture + 1, picture).save(tmp_path / "a.png")
     assert not list(tmp_path.iterdir())
+
+
+DOORS = """
+import sys
+sys.modules.update(dict.fromkeys(MISSING))
+import numpy as np
+import mrt_mitsuba as mrt
+mrt.register()
+picture = np.full((4, 4, 3), 0.5, np.float32)
+scene = mrt.scene_dict(0, width=8, height=6)
+case = {"aa": 1, "aamode": "none"}
+doors = {
+    "check": lambda: mrt.check_bsdf({"type": "diffuse"}, quick=True).save("check"),
+    "page": lambda: mrt.check_emitter({"type": "constant"}, quick=True)._repr_html_(),
+    "compare": lambda: mrt.compare(picture, picture).save("compare"),
+    "errors": lambda: mrt.error_vs_time(scene, {"a": case}, reference=case | {"aa": 2}, repeats=2).save("e"),
+    "rough": lambda: mrt.compare_roughconductor(alpha=0.3),
+    "sweep": lambda: mrt.sweep(0, "sweep", grid={"seed": [1]}, workers=1, width=8, height=6, **case),
+}
+for name, door in doors.items():
+    try:
+        door()
+    except mrt.MrtError as error:
+        assert "is not installed: pip install 'mrt-mitsuba[" in str(error), (name, error)
+        print(name)
+"""
+
+
+@pytest.mark.parametrize(
+    ("missing", "closed"),
+    [
+        (["jinja2"], "check page errors"),
+        (["scipy"], "check page errors rough"),
+        (["matplotlib"], "compare errors"),
+        (["dask"], "sweep"),
+        (["psutil"], "sweep"),
+    ],
+)
+def test_doors_say_what_is_not_installed(run_python, missing, closed):
+    done = run_python(DOORS.replace("MISSING", repr(missing)))
+    assert done.stdout.split() == closed.split()

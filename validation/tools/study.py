@@ -27,7 +27,7 @@ import numpy as np
 import PIL.Image
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.errors import OutputError, needs_extra
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.output.replacing import check_target, replacing
@@ -291,6 +291,7 @@ def notebook(study: Study, *, title: str) -> str:
     return f'<iframe srcdoc="{page}" style="width: 100%; height: 40rem; border: 1px solid #d5d8dd"></iframe>'
 
 
+@needs_extra()
 def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[str, bytes]:
     """Every file of the report by name. A figure is drawn once, for its file and for the page."""
     import jinja2

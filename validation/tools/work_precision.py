@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import MrtError, UsageError
+from mrt_mitsuba.errors import MrtError, UsageError, needs_extra
 from mrt_mitsuba.options import is_path
 from mrt_mitsuba.rendering.api import Result, render
 from mrt_mitsuba.rendering.progress import Progress
@@ -226,10 +226,12 @@ class Findings:
         describe(study, self, "", "All cases")
         return study
 
+    @needs_extra()
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
         save_report(folder, self.study(), title=TITLE)
 
+    @needs_extra()
     def _repr_html_(self) -> str:
         return notebook(self.study(), title=TITLE)
 
@@ -266,6 +268,7 @@ def _shown(value: float, low: float, high: float) -> str:
 # ---------------------------------------------- Measuring ----------------------------------------------
 
 
+@needs_extra()
 def error_vs_time(
     scene: Given,
     cases: Mapping[str, Options],
