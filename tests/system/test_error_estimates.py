@@ -155,6 +155,31 @@ def test_whole_pictures_state_their_error():
     assert 0.6 < np.median(ratios) < 1.6
 
 
+@pytest.mark.parametrize("goal", [{"aamode": "noise", "spp": 64}, {"target": 0.05, "maxspp": 512}])
+def test_whole_pictures_have_seeds_of_their_own(goal):
+    """Halves, scouts and rounds: with a seed in common, their difference would say nothing of the error."""
+    seeds = []
+
+    class Whole(mi.SamplingIntegrator):
+        def render(self, scene: Any, sensor: Any = 0, seed: int = 0, spp: int = 1, *_: Any, **__: Any) -> Any:
+            seeds.append(seed)
+            film = sensor.film()
+            film.prepare([])
+            draws = np.random.default_rng(seed).normal(0.5, 1 / math.sqrt(spp), (24, 32, 1))
+            values = np.broadcast_to(
+                spp * np.append(draws, np.ones_like(draws), 2)[..., [0, 0, 0, 1]], (24, 32, 4)
+            )
+            block = mi.ImageBlock(mi.TensorXf(values), offset=[0, 0], rfilter=film.rfilter(), border=False)
+            film.put_block(block)
+            return film.develop()
+
+    result = mrt.render(camera(32, 24), integrator=Whole(mi.Properties()), seed=3, **goal)
+    assert len(result.rounds) > 1
+    assert len(set(seeds)) == len(seeds) > 4
+    # of 768 squares, known to 5 %
+    assert _rmse(result.image, 0.5) / result.error.rmse == pytest.approx(1, abs=0.2)
+
+
 def test_a_header_says_that_an_error_has_no_upper_end():
     with pytest.warns(mrt.MrtWarning, match="a few rays rule the error"):
         result = mrt.render(camera(24, 16), integrator=noise(rare=0.0005), aamode="noise", spp=64, seed=2)
