@@ -631,8 +631,11 @@ def _drawn(stated: np.ndarray, measured: np.ndarray) -> float:
 
     The more squares make up that sum, the nearer.
     """
+    whole = stated.sum(dtype=np.float64)
+    if whole == 0:
+        return 1.0
     number = number_of(measured)
-    ratio = measured.sum(dtype=np.float64) / max(stated.sum(dtype=np.float64), 1e-300)
+    ratio = measured.sum(dtype=np.float64) / whole
     return float(max(ratio, LEAST_RATIO) ** (number / (number + STATED)))
 
 
@@ -653,8 +656,11 @@ def _factor(
     step = max(1, deviation.size // RANKED)
     every = deviation.ravel()[::step]
     there = have.ravel()[::step]
+    total = deviation.sum()
+    if total == 0:  # no pixels, or none with noise
+        return 0.0
     low = 0.0
-    high = (room + have.sum()) / deviation.sum()
+    high = (room + have.sum()) / total
     for _ in range(24):
         factor = (low + high) / 2
         rays = np.maximum(factor * every, there)

@@ -180,6 +180,18 @@ def test_whole_pictures_have_seeds_of_their_own(goal):
     assert _rmse(result.image, 0.5) / result.error.rmse == pytest.approx(1, abs=0.2)
 
 
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (3, 1)])
+@pytest.mark.parametrize("goal", [{"aamode": "noise", "spp": 40}, {"target": 0.1}, {"target": "30%"}])
+@pytest.mark.filterwarnings("ignore::mrt_mitsuba.MrtWarning")
+def test_a_film_may_be_smaller_than_a_chessboard(size, rfilter, goal):
+    """A field without pixels shares nothing, and nothing is divided by its noise."""
+    for seed in range(4):
+        result = mrt.render(camera(*size, rfilter), integrator=noise(), seed=seed, **goal)
+        assert np.isfinite(result.image).all()
+        assert result.rounds[-1].spp >= 8
+
+
 def test_a_header_says_that_an_error_has_no_upper_end():
     with pytest.warns(mrt.MrtWarning, match="a few rays rule the error"):
         result = mrt.render(camera(24, 16), integrator=noise(rare=0.0005), aamode="noise", spp=64, seed=2)
