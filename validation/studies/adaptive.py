@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -172,8 +172,8 @@ class Kernels(Progress):
     def __init__(self) -> None:
         self.records: list[Row] = []
 
-    def kernels(self, records: list[Row]) -> None:
-        self.records += [record for record in records if record["type"] == dr.KernelType.JIT]
+    def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
+        self.records += [dict(record) for record in records if record["type"] == dr.KernelType.JIT]
 
     def path(self) -> float:
         """The time of a ray in all rounds over that in the first, in which all pixels get the same rays."""
