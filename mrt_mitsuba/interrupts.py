@@ -51,6 +51,7 @@ def held() -> Iterator[None]:
         yield
         return
     _holder = threading.get_ident()
+    _waiting.clear()  # nothing waits outside a block
     try:
         for number in SIGNALS:
             if callable(handler := signal.getsignal(number)):
@@ -60,9 +61,10 @@ def held() -> Iterator[None]:
     finally:
         before = _handlers.copy()
         _handlers.clear()
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        heed(before)
+        with contextlib.ExitStack() as restored:  # all of them, though another signal may come in between
+            restored.callback(heed, before)
+            for number, handler in before.items():
+                restored.callback(signal.signal, number, handler)
 
 
 def _forked() -> None:

@@ -196,6 +196,34 @@ def test_interrupt_leaves_all_files_old_or_makes_all_new(tmp_path, monkeypatch, 
     assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
+@pytest.mark.parametrize("restored", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_while_a_block_ends_leaves_nothing_behind(monkeypatch, heeded, restored):
+    """Handlers are back, and what waited is not raised in a later block, as once in many runs."""
+    before = signal.getsignal(signal.SIGHUP)
+    handlers = {signal.SIGTERM: signal.default_int_handler, signal.SIGHUP: lambda *_: None}
+    kept = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    set_handler = signal.signal
+
+    def interrupted(number: int, handler: Any) -> Any:
+        old = set_handler(number, handler)
+        if number == restored and handler is signal.default_int_handler:
+            signal.raise_signal(signal.SIGINT)
+        return old
+
+    try:
+        with pytest.raises(KeyboardInterrupt), interrupts.held():
+            signal.raise_signal(signal.SIGINT)
+            monkeypatch.setattr(signal, "signal", interrupted)
+        monkeypatch.undo()
+        assert {number: signal.getsignal(number) for number in handlers} == handlers
+        with interrupts.held():
+            interrupts.heed()
+    finally:
+        for number, handler in kept.items():
+            set_handler(number, handler)
+    assert signal.getsignal(signal.SIGHUP) == before
+
+
 def test_leftovers_of_killed_processes_are_removed(tmp_path, image):
     names = (16 * "0", 16 * "1", 16 * "2", "a-file-of-the-user")
     left, alive, recent, own = (tmp_path / f".mrt-{name}.tmp" for name in names)
