@@ -37,8 +37,8 @@ Version = tuple[int, ...]
 class Choice(NamedTuple):
     """The chosen library, and the reason.
 
-    ``path``: the library, or None. ``version``: its version, or None where it is unknown before it is loaded.
-    ``source``: where it is from, or "none". ``rejected``: one line for each library that was passed over.
+    ``path``: the library, and ``version``: its version, or None. ``source``: where it is from, or "none".
+    ``rejected``: one line for each library that was passed over.
     """
 
     path: str | None
@@ -47,55 +47,48 @@ class Choice(NamedTuple):
     rejected: list[str]
 
     def describe(self) -> str:
-        """Return one sentence for people."""
-        if self.path is None:
+        """One sentence for people."""
+        if self.version is None:
             but = f", but {'; '.join(self.rejected)}" if self.rejected else ""
             return f"no usable LLVM {OLDEST} or newer was found{but}. {HELP}"
         return f"LLVM {version_text(self.version)}, {self.source}: {self.path}"
 
 
-def version_text(version: Version | None) -> str:
-    """Return a version as text, e.g. "19.1"; "none" for None."""
-    return "none" if version is None else ".".join(map(str, version)) if version[0] else "older than 16"
+def version_text(version: Version) -> str:
+    """A version as text, e.g. "19.1"."""
+    return ".".join(map(str, version)) if version[0] else "older than 16"
 
 
-def choose(
-    environ: Mapping[str, str] = os.environ,
-    search_path: Iterable[str] | None = None,
-    system: Iterable[str] | None = None,
-) -> Choice:
+def choose(environ: Mapping[str, str], search_path: Iterable[str], system: Iterable[str]) -> Choice:
     """Choose a library by the rule above; changes nothing.
 
-    ``search_path``: folders that may hold installed packages (default ``sys.path``). ``system``: folders to
-    search for a system library (default: the usual ones of a Linux system).
+    ``search_path``: folders that may hold installed packages; ``system``: folders to search for a system
+    library.
     """
-    wheel, problem = wheel_library(sys.path if search_path is None else search_path)
+    wheel, problem = wheel_library(search_path)
     named = environ.get(VARIABLE, "")
-
-    def candidates() -> Iterator[tuple[str, str, str]]:
-        """Yield path, where it is from, and what speaks against it."""
-        if named not in ("", BLOCKED, wheel):
-            yield named, f"named by {VARIABLE}", ""
-        if wheel:
-            yield wheel, f"from the package {WHEEL}", problem
-        folders = system_folders(environ) if system is None else system
-        paths = {os.path.realpath(path) for path in _matching(folders, "libLLVM")} - {os.path.realpath(wheel)}
-        versions = {path: version for path in paths if (version := version_in_name(path))}
-        for path in sorted(filter(os.path.isfile, versions), key=lambda path: (versions[path], path))[::-1]:
-            yield path, "of the system", ""
-
+    candidates = []  # path, where it is from, and what speaks against it
+    if named not in ("", BLOCKED, wheel):
+        candidates.append((named, f"named by {VARIABLE}", ""))
+    if wheel:
+        candidates.append((wheel, f"from the package {WHEEL}", problem))
+    paths = {os.path.realpath(path) for path in _matching(system, "libLLVM")} - {os.path.realpath(wheel)}
+    versions = [(version_in_name(path) or (), path) for path in filter(os.path.isfile, paths)]
+    for version, path in sorted(versions, reverse=True):
+        if version:
+            candidates.append((path, "of the system", ""))
     rejected: list[str] = []
-    for path, source, objection in candidates():
-        version = version_of(path)
-        if version and version[0] >= OLDEST and not objection:
-            return Choice(path, version, source, rejected)
-        what = f"is LLVM {version_text(version)}" if version else "cannot be loaded"
+    for path, source, objection in candidates:
+        found = version_of(path)
+        if found and found[0] >= OLDEST and not objection:
+            return Choice(path, found, source, rejected)
+        what = f"is LLVM {version_text(found)}" if found else "cannot be loaded"
         rejected.append(objection or f"{path}, {source}, {what}")
     return Choice(None, None, "none", rejected)
 
 
 def wheel_library(search_path: Iterable[str]) -> tuple[str, str]:
-    """Return the library of the package karellen-llvm-core and what speaks against it, or "" for each.
+    """The library of the package karellen-llvm-core and what speaks against it, "" for neither.
 
     Its path is taken from the list of files (RECORD) in the package's metadata. ``importlib.metadata`` gives
     the same, but importing it takes 30 ms.
@@ -116,8 +109,8 @@ def wheel_library(search_path: Iterable[str]) -> tuple[str, str]:
     return "", ""
 
 
-def system_folders(environ: Mapping[str, str] = os.environ) -> list[str]:
-    """Return the folders in which a Linux system keeps libLLVM."""
+def system_folders(environ: Mapping[str, str]) -> list[str]:
+    """The folders in which a Linux system keeps libLLVM."""
     return [
         *filter(None, environ.get("LD_LIBRARY_PATH", "").split(":")),
         f"{sys.prefix}/lib",  # conda
@@ -138,14 +131,14 @@ def _matching(folders: Iterable[str], prefix: str) -> Iterator[str]:
 
 
 def version_in_name(path: str) -> Version | None:
-    """Return the version in a file name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1, or None."""
+    """The version in a file name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1, or None."""
     name = re.fullmatch(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.so(?:\.(\d+(?:\.\d+)*))?", os.path.basename(path))
     numbers = name and (name[1] or name[2])
     return tuple(map(int, numbers.split("."))) if numbers else None
 
 
 def version_of(library: str) -> Version | None:
-    """Return the version of a library, given by path or by a name for the dynamic linker; None: unusable.
+    """The version of a library, given by path or by a name for the dynamic linker; None: unusable.
 
     Where neither the name nor the target of a symbolic link holds it, the library is asked, in a process of
     its own.
@@ -185,7 +178,7 @@ def prepare() -> Choice:
     Warns where the user's own setting is not followed, and where Dr.Jit was imported before the choice.
     """
     early = "drjit" in sys.modules
-    choice = choose()
+    choice = choose(os.environ, sys.path, system_folders(os.environ))
     text = None
     os.environ[VARIABLE] = choice.path or BLOCKED
     if early and choice.path:
@@ -198,7 +191,7 @@ def prepare() -> Choice:
 
 
 def problem(choice: Choice) -> str | None:
-    """Return the obstacle to Dr.Jit's use of LLVM, with the fix, or None."""
+    """The obstacle to Dr.Jit's use of LLVM, with the fix, or None."""
     if choice.path is None:
         return choice.describe()
     import drjit as dr

@@ -1,4 +1,5 @@
-"""The changes that this package makes in Mitsuba: ``CHANGES`` lists each with its reason.
+"""The changes that this package makes in Mitsuba: ``CHANGES`` lists each with its reason. Mitsuba needs them
+since 3.9 at least.
 
 ``make()`` puts the changes into effect, ``undo()`` takes them back; ``mrt.register(guard=False)`` leaves
 them out. Names, signatures and pickles of what is changed stay Mitsuba's. A change is known by the function
@@ -16,7 +17,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, reduce, wraps
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -61,12 +62,10 @@ one_at_a_time = Turn()
 # ----------------------------------------------- The list ----------------------------------------------
 
 
-@dataclass(frozen=True)
-class Replacement:
+class Replacement(NamedTuple):
     """A function that was put in place of one of Mitsuba's."""
 
-    owner: Any
-    home: Any  # the module that the function is pickled by, or the owner
+    owner: Any  # the module or class that has it
     name: str
     theirs: Function
     ours: Function
@@ -79,8 +78,6 @@ class Replacement:
             delattr(self.owner, self.name)
         elif alone:
             setattr(self.owner, self.name, self.theirs)
-        if getattr(self.home, self.name) is self.ours:
-            setattr(self.home, self.name, self.theirs)
         return alone
 
 
@@ -92,7 +89,6 @@ class Change:
     ours: Function  #: what is called in its place: with the function itself, then its arguments
     what: str
     why: str
-    since: str = "Mitsuba 3.9"  #: the first release that needs it, as far as is known
     made: list[Replacement] = field(default_factory=list)  #: in the variants so far
 
     def make(self) -> None:
@@ -111,20 +107,17 @@ class Change:
 
         with contextlib.suppress(ValueError, TypeError):  # functions in C++ have none
             call.__signature__ = inspect.signature(theirs)  # type: ignore[attr-defined]
-        home = _home(owner, name, theirs)
-        self.made.append(Replacement(owner, home, name, theirs, call, inherited=name not in vars(owner)))
-        for each in (owner, home):
+        owners = [owner]
+        home = sys.modules.get(getattr(theirs, "__module__", None) or "")  # which it is pickled by
+        if inspect.ismodule(owner) and getattr(home, name, None) is theirs:
+            owners.append(home)
+        for each in owners:
+            self.made.append(Replacement(each, name, theirs, call, inherited=name not in vars(each)))
             setattr(each, name, call)
 
     def undo(self) -> None:
         """Take our functions back; those inside of somebody else's only pass calls on."""
         self.made = [each for each in self.made if not each.undo()]
-
-
-def _home(owner: Any, name: str, function: Function) -> Any:
-    """Return the module that a function of Mitsuba's is pickled by, or its owner."""
-    module = sys.modules.get(getattr(function, "__module__", None) or "")
-    return module if inspect.ismodule(owner) and getattr(module, name, None) is function else owner
 
 
 CHANGES: list[Change] = []
@@ -142,7 +135,7 @@ def change(where: str, *, what: str, why: str) -> Callable[[Function], Function]
 
 
 def _argument(place: int, name: str, args: tuple[Any, ...], given: dict[str, Any]) -> Any:
-    """Return an argument of one of Mitsuba's functions, None where there is none: Mitsuba says so."""
+    """An argument of one of Mitsuba's functions; None where it is missing, which Mitsuba reports."""
     return args[place] if place < len(args) else given.get(name)
 
 
@@ -150,12 +143,12 @@ def _argument(place: int, name: str, args: tuple[Any, ...], given: dict[str, Any
 
 
 def of_this_package(thing: object) -> bool:
-    """Return whether this package has the class of an object."""
+    """Whether this package has the class of an object."""
     return type(thing).__module__.startswith("mrt_mitsuba.")
 
 
 def needs_turn(scene: mi.Scene, integrator: mi.Integrator) -> bool:
-    """Return whether a render runs Python code of ours, and none of somebody else's that may wait for it."""
+    """Whether a render runs Python code of ours, and none of somebody else's that may wait for it."""
     if of_this_package(integrator):
         return True
     if not plugins.any_constructed() or not isinstance(integrator, mi.Integrator):
@@ -261,7 +254,7 @@ _LOADING = {
 
 @change("mi.load_dict", **_LOADING)
 def load_dict_in_turn(load: Function, /, *args: object, **given: object) -> object:
-    waiting = [args[0] if args else given.get("dict")]
+    waiting = [_argument(0, "dict", args, given)]
     seen = set[int]()  # a dict may lie in itself
     ours = False
     while waiting and not ours:
@@ -275,18 +268,17 @@ def load_dict_in_turn(load: Function, /, *args: object, **given: object) -> obje
 
 @change("mi.load_string", **_LOADING)
 def load_string_in_turn(load: Function, /, *args: object, **given: object) -> object:
-    text = args[0] if args else given.get("value")
+    text = _argument(0, "value", args, given)
     ours = isinstance(text, str) and any(hint.decode() in text for hint in HINTS)
     return _load(load, ours, "value", *args, **given)
 
 
 @change("mi.load_file", **_LOADING)
 def load_file_in_turn(load: Function, /, *args: object, **given: object) -> object:
-    path = args[0] if args else given.get("path")
     ours = False
     # Mitsuba itself reports what cannot be read. What is no file, such as a pipe, can be read only once
     with contextlib.suppress(OSError, ValueError, TypeError):
-        name = str(mi.file_resolver().resolve(os.fspath(path)))  # type: ignore[call-overload]
+        name = str(mi.file_resolver().resolve(os.fspath(_argument(0, "path", args, given))))
         state = os.stat(name)
         ours = not stat.S_ISREG(state.st_mode) or state.st_size > LARGEST_SEARCHED
         if not ours:
@@ -395,5 +387,5 @@ def mitsuba_first(folder: str | None = None) -> None:
 
 @cache
 def mitsuba_home() -> str:
-    """Return the folder in which Mitsuba is installed."""
+    """The folder in which Mitsuba is installed."""
     return os.path.dirname(os.path.abspath(mi.__file__))

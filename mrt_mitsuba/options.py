@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.target import Target
+from mrt_mitsuba.target import Target, plain
 
 Value = TypeVar("Value")
 Values = Mapping[str, Any]  # by the names of options or parameters
+StrPath = str | os.PathLike[str]
 
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
@@ -115,8 +116,8 @@ def _target(value: Any) -> Target | tuple[float, ...]:
     return _only(target, target.positive)
 
 
-def _target_in(text: str) -> Any:
-    return _reals_in(text) if "," in text else plain(text)
+def _target_in(text: str) -> str | tuple[float, ...]:
+    return _reals_in(text) if "," in text else text
 
 
 def _bytes(value: Any) -> int:
@@ -171,13 +172,6 @@ PARAMETERS = Kind(
     "a dict of values by names of an XML file or keys of mi.traverse, such as material_0.alpha",
     _parameters,
 )
-
-
-def plain(text: str) -> str:
-    """Check text that may be a number: spaces and underscores, which ``int`` takes, raise ``ValueError``."""
-    if not text.isascii() or "_" in text or text != text.strip():
-        raise ValueError
-    return text
 
 
 def either(names: Sequence[str]) -> str:

@@ -9,6 +9,13 @@ from dataclasses import dataclass
 PERCENT = "%"
 
 
+def plain(text: str) -> str:
+    """The text of a number as it is; spaces and underscores, which ``float`` takes, raise ``ValueError``."""
+    if not text.isascii() or "_" in text or text != text.strip():
+        raise ValueError(f"{text!r} is not a number")
+    return text
+
+
 @dataclass(frozen=True)
 class Target:
     """An RMSE to the converged picture, linear: a number, or a share of the picture's mean luminance.
@@ -31,12 +38,9 @@ class Target:
             raise TypeError("a target is a number or a percentage")
         if not isinstance(value, str):
             return cls(float(value))  # type: ignore[arg-type]
-        number = value.removesuffix(PERCENT)
-        if number != number.strip() or "_" in number or not number.isascii():
-            raise ValueError(f"{value!r} is neither a number nor a percentage")
-        if number == value:
-            return cls(float(number))
-        return cls(float(number) / 100, relative=True)
+        number = float(plain(value.removesuffix(PERCENT)))
+        relative = value.endswith(PERCENT)
+        return cls(number / 100 if relative else number, relative)
 
     @property
     def positive(self) -> bool:

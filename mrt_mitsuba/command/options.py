@@ -12,6 +12,7 @@ from typing import Any
 from mrt_mitsuba.command.registry import split
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import SWITCH, Kind, check, choice, either, is_obj, option, table
+from mrt_mitsuba.output.files import TONEMAP
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.report import NUMBERS
@@ -44,9 +45,7 @@ class Options(RenderSettings):
         "none",
     )
     format: str = option("both", choice("png", "exr", "both"), "files to write")
-    tonemap: str = option(
-        "report", choice("report", "srgb"), "values in the PNG: linear as in the report, or sRGB"
-    )
+    tonemap: str = option("report", TONEMAP, "values in the PNG: linear as in the report, or sRGB")
     plan: str = option("hide", choice("show", "hide"), "print what will run and what is left out, and why")
     quiet: bool = option(False, SWITCH, "print errors only", "0")
     log: str = option("warn", choice(*LEVELS), "what to print: warnings; times; every kernel")

@@ -88,8 +88,11 @@ def luma_edges(
     Raises:
         UsageError: for a wrong shape, or a threshold that is NaN.
     """
-    thresholds = {"absolute_threshold": absolute_threshold, "relative_threshold": relative_threshold}
-    check_numbers(contrast_offset=contrast_offset, **thresholds)
+    check_numbers(
+        contrast_offset=contrast_offset,
+        absolute_threshold=absolute_threshold,
+        relative_threshold=relative_threshold,
+    )
     grid = Grid(image)
     brightness = _sum(grid.planes(image, "image"), LUMA_WEIGHTS)
     luma = dr.select(dr.isfinite(brightness), dr.sqrt(dr.maximum(brightness, 0)), math.inf)

@@ -14,6 +14,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import OutputError, UsageError, warn
 from mrt_mitsuba.machine import usable_cores
+from mrt_mitsuba.options import StrPath, Values, check, choice
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.output.replacing import replacing
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
     Image = NDArray[np.float32]
 
-Path = str | os.PathLike[str]
-
 # For zlib to look for runs only: as fast as its level 1, and 161 kB for scene 3 in place of 206
 PNG_RUNS = 3
 
@@ -32,7 +31,7 @@ PNG_RUNS = 3
 # a third of the bytes, or two where there is much sky: the last digits of colours are noise
 COMPRESSED = 2**20  # pixels
 
-TONEMAPS = ("report", "srgb")
+TONEMAP = choice("report", "srgb")
 _PIXELS = 2**14  # converted to 8 bit at a time, so that intermediate arrays stay in the processor's cache
 
 
@@ -42,13 +41,13 @@ all float32; ``header``: its values by name."""
 
 
 def save(
-    paths: Path | Sequence[Path],
+    paths: StrPath | Sequence[StrPath],
     image: Image,
     *,
     layers: Mapping[str, Image] | None = None,
-    header: Mapping[str, Any] | None = None,
+    header: Values | None = None,
     tonemap: str = "report",
-    inputs: Iterable[Path] = (),
+    inputs: Iterable[StrPath] = (),
 ) -> None:
     """Write a linear picture [H, W, 3] in the formats that the endings of ``paths`` name, .png or .exr.
 
@@ -60,8 +59,7 @@ def save(
     Raises ``OutputError`` for a file that cannot be written, or that is one of ``inputs``; ``UsageError``
     without a name.
     """
-    if tonemap not in TONEMAPS:
-        raise UsageError(f"tonemap={tonemap!r}: must be {' or '.join(TONEMAPS)}")
+    check("tonemap", TONEMAP, tonemap)
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not paths:
         raise UsageError('save: give the name of a file, such as "out.exr"')
@@ -80,17 +78,17 @@ def save(
                 _write_exr(file, image, layers or {}, header or {})
 
 
-def write_png(path: Path, image: Image, *, tonemap: str = "report") -> None:
+def write_png(path: StrPath, image: Image, *, tonemap: str = "report") -> None:
     """Write a linear picture [H, W, 3] as PNG, whatever the path's ending; see ``save``."""
     with replacing(path) as (file,):
         _write_png(file, image, tonemap)
 
 
 def write_exr(
-    path: Path,
+    path: StrPath,
     image: Image,
     layers: Mapping[str, Image] | None = None,
-    header: Mapping[str, Any] | None = None,
+    header: Values | None = None,
 ) -> None:
     """Write a linear picture [H, W, 3] as float32 EXR, whatever the path's ending; see ``save``."""
     with replacing(path) as (file,):
@@ -107,7 +105,7 @@ def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
     picture.save(file, format="PNG", compress_type=PNG_RUNS)
 
 
-def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Mapping[str, Any]) -> None:
+def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Values) -> None:
     """Write the picture [H, W, 3] and its layers, [H, W] for each channel; arrays are copied only where the
     library would. Raises ``OutputError`` if a shape does not fit."""
     import numpy as np
@@ -153,7 +151,7 @@ def compressing(pixels: int) -> Iterator[Any]:
         OpenEXR.set_global_thread_count(before)
 
 
-def read_exr(path: Path) -> Picture:
+def read_exr(path: StrPath) -> Picture:
     """Read an EXR with the channels R, G, B; ``OutputError`` if it is none, or broken."""
     import numpy as np
 
@@ -165,7 +163,7 @@ def read_exr(path: Path) -> Picture:
     return Picture(image, planes, headers["R"])
 
 
-def read_channels(path: Path) -> tuple[dict[str, Image], dict[str, dict[str, Any]]]:
+def read_channels(path: StrPath) -> tuple[dict[str, Image], dict[str, dict[str, Any]]]:
     """Every channel of an EXR, [H, W] float32 by name, and the header of each.
 
     Where a file has several parts, their names come before those of their channels. Raises ``OutputError``
@@ -247,8 +245,7 @@ def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]
     """The picture in 8 bit as ``to_8bit`` gives it, some rows at a time with the number of the first."""
     import numpy as np
 
-    if tonemap not in TONEMAPS:
-        raise UsageError(f"tonemap={tonemap!r}: must be {' or '.join(TONEMAPS)}")
+    check("tonemap", TONEMAP, tonemap)
     rows = max(1, _PIXELS // image.shape[1])
     lost = 0
     for row in range(0, len(image), rows):

@@ -16,15 +16,14 @@ import stat
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
-from pathlib import Path as Folder
+from pathlib import Path
 from typing import IO
 
 from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.options import StrPath
 
 log = logging.getLogger(__name__)
-
-Path = str | os.PathLike[str]
 
 _TEMPORARY = ".mrt-{}.tmp"
 _OLD = 10.0  # seconds after which a file that nobody has locked was left over
@@ -32,7 +31,7 @@ unfinished: set[str] = set()  #: temporary files and folders of this process
 _tidied: set[str] = set()  # folders
 
 
-def check_target(path: Path, inputs: Iterable[Path] = ()) -> None:
+def check_target(path: StrPath, inputs: Iterable[StrPath] = ()) -> None:
     """Raise ``OutputError`` if ``path`` cannot be written; for use before the work. Leaves no trace.
 
     ``inputs``: files that the work reads; none of them is written, by whatever path or link.
@@ -42,7 +41,7 @@ def check_target(path: Path, inputs: Iterable[Path] = ()) -> None:
 
 
 @contextlib.contextmanager
-def replacing(*paths: Path, inputs: Iterable[Path] = ()) -> Iterator[list[IO[bytes]]]:
+def replacing(*paths: StrPath, inputs: Iterable[StrPath] = ()) -> Iterator[list[IO[bytes]]]:
     """Give binary files to write to, which replace ``paths``, all of them, once all has gone well.
 
     A symbolic link stays and its target is replaced. Whatever is raised inside, the old files stay as they
@@ -80,7 +79,7 @@ def discard_unfinished() -> None:
 
 
 @contextlib.contextmanager
-def temporary_folder(folder: Path, prefix: str) -> Iterator[str]:
+def temporary_folder(folder: StrPath, prefix: str) -> Iterator[str]:
     """Give a new folder in another, removed at the end; its name begins with ``prefix``."""
     name = tempfile.mkdtemp(prefix=prefix, dir=folder)
     unfinished.add(name)
@@ -92,7 +91,7 @@ def temporary_folder(folder: Path, prefix: str) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def _explained(*paths: Path) -> Iterator[None]:
+def _explained(*paths: StrPath) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -100,7 +99,7 @@ def _explained(*paths: Path) -> Iterator[None]:
         raise OutputError(f"cannot write {names}: {error.strerror or error}") from error
 
 
-def _target(path: Path, inputs: Iterable[Path]) -> str:
+def _target(path: StrPath, inputs: Iterable[StrPath]) -> str:
     """The real path to write; ``OutputError`` where replacing a file would be wrong."""
     name = os.fspath(path)
     if "\0" in name or os.path.basename(name) in ("", ".", ".."):
@@ -141,7 +140,7 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
     """Give a new file in a folder, locked, with the rights of the user's umask; remove it at the end."""
     if folder not in _tidied:
         _tidied.add(folder)
-        for left in Folder(folder).glob(_TEMPORARY.format(16 * "[0-9a-f]")):  # of processes that were killed
+        for left in Path(folder).glob(_TEMPORARY.format(16 * "[0-9a-f]")):  # of processes that were killed
             with contextlib.suppress(OSError):
                 state = left.lstat()
                 if stat.S_ISREG(state.st_mode) and time.time() - state.st_mtime > _OLD:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
-import operator
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.machine import Budget
-from mrt_mitsuba.options import check, choice
+from mrt_mitsuba.options import StrPath, Values, check, choice
 from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.scene.loading import load_file
 from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Node, Scene
@@ -21,6 +21,7 @@ from mrt_mitsuba.scene.report import report_scene
 
 if TYPE_CHECKING:
     import mitsuba as mi
+    from numpy.typing import ArrayLike
 
 FLAVORS = ("mrt", "stock")
 
@@ -52,14 +53,14 @@ def scene_dict(
 
 
 def write_xml(
-    scene: int | Scene | str | os.PathLike[str],
-    path: str | os.PathLike[str],
+    scene: int | Scene | StrPath,
+    path: StrPath,
     *,
     flavor: str = "mrt",
     fresnel: str | None = None,
     width: int | None = None,
     height: int | None = None,
-    params: Mapping[str, Any] | None = None,
+    params: Values | None = None,
     **model: Any,
 ) -> list[str]:
     """Write a scene as XML through Mitsuba's own writer; return the paths of what was written.
@@ -152,15 +153,14 @@ def _stock(nodes: Node, scene: Scene) -> Node:
             value = [squared * c for c in node["intensity"]["value"]]
             result[name] = {**node, "type": "point", "intensity": {"type": "rgb", "value": value}}
         elif kind == "mrt_plane":
-            foot = [-node["distance"] * c for c in _unit(node["normal"])]
+            foot = np.multiply(-node["distance"] / np.linalg.norm(node["normal"]), node["normal"])
             square = _facing(foot, node["normal"], STOCK_EXTENT / 2)
             result[name] = {"type": "rectangle", "to_world": square, "bsdf": node["bsdf"]}
         elif kind == "mrt_cylinder":  # an open tube, and at each end a disc that faces away from the other
             result[f"{name}_tube"] = {**result.pop(name), "type": "cylinder"}
             ends = node["p0"], node["p1"]
             for number, (center, opposite) in enumerate((ends, ends[::-1])):
-                outwards = list(map(operator.sub, center, opposite))
-                to_world = _facing(center, outwards, node["radius"])
+                to_world = _facing(center, np.subtract(center, opposite), node["radius"])
                 result[f"{name}_disc{number}"] = {"type": "disk", "to_world": to_world, "bsdf": node["bsdf"]}
         elif kind.startswith("mrt_"):
             raise SceneError(
@@ -184,17 +184,11 @@ def _stock_bsdf(node: Node) -> Node:
     return {"type": "roughplastic", "distribution": "beckmann", **rough, **colors}
 
 
-def _unit(vector: list[float]) -> list[float]:
-    length = math.hypot(*vector)
-    return [c / length for c in vector]
-
-
-def _facing(center: list[float], normal: list[float], half_size: float) -> mi.ScalarTransform4f:
+def _facing(center: ArrayLike, normal: ArrayLike, half_size: float) -> mi.ScalarTransform4f:
     """The transform that takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
     import mitsuba as mi
 
-    normal = _unit(normal)
-    up = [0, 0, 1] if abs(normal[2]) < 0.9 else [1, 0, 0]
-    ahead = list(map(operator.add, center, normal))
-    to_world = mi.ScalarTransform4f().look_at(center, ahead, up)
+    ahead = np.divide(normal, np.linalg.norm(normal))
+    up = [0, 0, 1] if abs(ahead[2]) < 0.9 else [1, 0, 0]
+    to_world = mi.ScalarTransform4f().look_at(np.array(center), np.add(center, ahead), up)
     return to_world.scale([half_size, half_size, 1])

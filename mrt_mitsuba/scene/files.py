@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mrt_mitsuba.errors import SceneError, warn
+from mrt_mitsuba.options import StrPath
 
 DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
 LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
@@ -17,7 +18,7 @@ _CONTINUED = b"\\\n"  # at the end of a line that goes on in the next
 MISSING = "is missing or may not be read in"  # what messages say about a file that a scene names
 
 
-def require_file(path: str | os.PathLike[str]) -> None:
+def require_file(path: StrPath) -> None:
     """Raise ``SceneError`` unless ``path`` is a file that may be read: pipes and devices may never end."""
     name = os.fspath(path)
     problem = ""

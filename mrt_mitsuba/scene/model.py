@@ -163,10 +163,11 @@ class Scene:
 
         shapes: Node = {}
         for kind, plugin in PLUGINS.items():
-            things = getattr(self, f"{kind}s")
-            many = len(things) > MOST_SINGLE.get(kind, math.inf)
-            grouped = [thing for thing in things if many and thing.material.texture is None]
-            single = [thing for thing in things if not many or thing.material.texture is not None]
+            single = getattr(self, f"{kind}s")
+            grouped = []
+            if len(single) > MOST_SINGLE.get(kind, math.inf):
+                grouped = [thing for thing in single if thing.material.texture is None]
+                single = [thing for thing in single if thing.material.texture is not None]
             for i, thing in enumerate(single):
                 *parameters, (_, material) = vars(thing).items()
                 values = {n: float(v) if n in ("radius", "distance") else list(v) for n, v in parameters}

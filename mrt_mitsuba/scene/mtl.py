@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.errors import SceneError
+from mrt_mitsuba.options import StrPath
 from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
 from mrt_mitsuba.scene.model import LARGEST, Color, Material
 
@@ -30,9 +30,7 @@ _STANDARD = Material(ior=1.0, alpha=1.0, specular=(0.0, 0.0, 0.0), diffuse=(0.8,
 _WITHOUT_EFFECT = {"d 1", "Tr 0", "illum 0", "illum 1", "illum 2", "sharpness 60", "Ke 0 0 0", "Tf 1 1 1"}
 
 
-def read_mtl(
-    path: str | os.PathLike[str], *, convention: str = "report", folder: Path | None = None
-) -> dict[str, Material]:
+def read_mtl(path: StrPath, *, convention: str = "report", folder: Path | None = None) -> dict[str, Material]:
     """The materials of an MTL file by name.
 
     ``convention``:

@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.options import StrPath
 from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
 from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Color, Light, Material, Mesh, Scene, Vector
 from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
@@ -70,9 +71,7 @@ _BLOCKS = re.compile(b"|".join(_RUNS) + rb"|(?P<line>[^\n]*\n)")
 _NUMBERS_ONLY = bytes(32 if chr(i) in "vtnf/\n" else i for i in range(256))
 
 
-def read_obj(
-    path: str | os.PathLike[str], *, convention: str = "report"
-) -> tuple[tuple[Mesh, ...], frozenset[str]]:
+def read_obj(path: StrPath, *, convention: str = "report") -> tuple[tuple[Mesh, ...], frozenset[str]]:
     """The meshes of an OBJ file, one for each material that is used, and the paths of all files of the model,
     used or not.
 
@@ -233,7 +232,7 @@ def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Materia
 
 
 def obj_scene(
-    path: str | os.PathLike[str],
+    path: StrPath,
     *,
     convention: str = "report",
     texturing: str | None = None,

@@ -48,8 +48,8 @@ _SCENES: list[Callable[[], Scene]] = []  # by number
 
 
 def _numbered(make: Callable[[], Scene]) -> Callable[[], Scene]:
-    """Give the scene that a function makes the next number."""
-    _SCENES.append(make)
+    """Give the scene that a function makes the next number. It is made once."""
+    _SCENES.append(cache(make))
     return make
 
 
@@ -268,11 +268,6 @@ def report_scene(number: int) -> Scene:
     """The scene of a number. Raises ``UsageError`` for any other."""
     if number not in NUMBERS:
         raise UsageError(f"there is no scene {number!r}: choose one of {', '.join(map(str, NUMBERS))}")
-    return _made(number)
-
-
-@cache
-def _made(number: int) -> Scene:
     return _SCENES[number]()
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from itertools import chain
 from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
-from mrt_mitsuba.options import check, integer
+from mrt_mitsuba.options import StrPath, Values, check, integer
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 from mrt_mitsuba.sweeps.folder import Facts, read_note, reserved
 from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, points
@@ -22,9 +22,9 @@ from mrt_mitsuba.sweeps.worker import describe
 
 def sweep(
     scene: Any,
-    out: str | os.PathLike[str],
+    out: StrPath,
     *,
-    grid: Mapping[str, Any] | None = None,
+    grid: Values | None = None,
     zipped: bool = False,
     workers: int | None = None,
     cluster: Any = None,

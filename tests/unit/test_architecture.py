@@ -133,7 +133,7 @@ def test_imports_make_no_cycle():
 rooms = Cases()
 rooms("plugins", {"plugins"})
 rooms("rays", {"rays"})
-rooms("output", {"output", "machine", "errors", "interrupts"})
+rooms("output", {"output", "machine", "errors", "interrupts", "options"})
 rooms("filters", {"filters", "errors", "llvm", "output"})
 rooms("scene", {"scene", "plugins", "output", *FOUNDATION})
 rooms("rendering", {"rendering", "plugins", "rays", "filters", "scene", "output", *FOUNDATION})
