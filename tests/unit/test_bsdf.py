@@ -46,7 +46,7 @@ def interaction(wi: np.ndarray, uv: Any = (0, 0)) -> Any:
 
 def draw(bsdf: mi.BSDF, wi: np.ndarray, count: int) -> probe.Lanes:
     numbers = np.random.default_rng(0).random((count, 3), np.float32)
-    return probe.Probe(bsdf).sample(wi, numbers, np.zeros(2))
+    return probe.Probe(bsdf).sample(probe.Lanes(wi=wi, u=numbers, uv=np.zeros(2)))
 
 
 @pytest.mark.parametrize("name", bsdf_laws.MATERIALS)
@@ -179,7 +179,7 @@ def test_lobes_are_chosen_by_their_mean_reflectance(diffuse, specular, share):
     colors = {"diffuse_reflectance": rgb(diffuse), "specular_reflectance": rgb(specular)}
     drawn = draw(bsdf(alpha=0.1, fresnel="unity", **colors), at_angle(0), 100_000)
     sigma = 0.5 / np.sqrt(100_000)
-    assert (drawn.component == 1).mean() == pytest.approx(share, abs=5 * sigma)
+    assert (drawn.lobe == 1).mean() == pytest.approx(share, abs=5 * sigma)
     brightest = max(max(diffuse) / (1 - share), max(specular) / share)
     assert drawn.weight.max() < 1.005 * brightest
 

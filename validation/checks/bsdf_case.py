@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +14,7 @@ import numpy as np
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.law import Skip
-from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Lanes, Probe, is_scalar, joined, unit
+from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Lanes, Probe, excess, is_scalar, joined, unit
 from mrt_mitsuba.validation.checks.sphere import DEPTH, POINTS, Cells, encode, integrate
 from mrt_mitsuba.validation.checks.subject import Given, Subject
 
@@ -33,9 +33,7 @@ class View:
     ``density`` is pdf() at the samples that count, of lobes with a width and not refused; 0 elsewhere.
     """
 
-    wi: Array  # [3]
-    uv: Array  # [2]
-    u: Array  # [N, 3]
+    at: Lanes  # wi [3] and uv [2]
     samples: Lanes  # [N]
     density: Array  # [N]
     pilot: Array  # directions of the pilots that count [P, 3]
@@ -62,69 +60,60 @@ class Case(Subject, Probe):
         views = []
         for angle in QUICK_ANGLES if self.quick else ANGLES:
             wi = probe.direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
-            uv = self.uniform(2)
+            at = Lanes(wi=wi, uv=self.uniform(2))
             u = self.uniform(self.count(2**16, 2**19), 3)
-            samples = self.sample(wi, u, uv)
-            value, pdf = self.both(wi, samples.wo, uv)
-            density = np.where(live(wi, samples, value, pdf), pdf, 0)
+            samples = self.sample(Lanes(wi=np.tile(wi, (len(u), 1)), uv=np.tile(at.uv, (len(u), 1)), u=u))
+            value, pdf = self.both(samples)
+            density = np.where(live(samples, value, pdf), pdf, 0)
             holes = (density > 0) & ~np.isfinite(value).all(axis=1)
             first = len(u) // 4
             pilot = samples.wo[:first][density[:first] > 0]
             codes = encode(samples.wo[first:][density[first:] > 0])
             count = len(u) - first
-            share = len(codes) / count
-            views.append(View(wi, uv, u, samples, density, pilot, codes, count, share, holes.mean()))
+            views.append(View(at, samples, density, pilot, codes, count, len(codes) / count, holes.mean()))
         return views
 
     @cached_property
-    def drawn(self) -> tuple[Lanes, Lanes]:
-        """The first samples of all views, and the ``wi``, ``uv`` and ``u`` that they were drawn with."""
-        few = slice(0, self.count(2**12, 2**13))
-        at = self.incidence.only(np.repeat(np.arange(len(self.views)), few.stop))
-        at.u = np.concatenate([view.u[few] for view in self.views])
-        return joined([view.samples.only(few) for view in self.views]), at
+    def drawn(self) -> Lanes:
+        """The first samples of all views."""
+        few = self.count(2**12, 2**13)
+        return joined([view.samples[:few] for view in self.views])
 
     @cached_property
     def incidence(self) -> Lanes:
         """The directions of incidence ``wi`` and texture coordinates ``uv`` of all views."""
-        wi = np.array([view.wi for view in self.views])
-        uv = np.array([view.uv for view in self.views])
-        return Lanes(wi=wi, uv=uv)
+        return joined([view.at[np.newaxis] for view in self.views])
 
     @cached_property
     def densities(self) -> list[Cells | None]:
         """The integrals of the density for each view, in cells that resolve it; None where none do."""
         return [self._integrals(view) for view in self.views]
 
+    def density(self, view: View, wo: Array) -> Array:
+        """The density of directions [M, 3] as seen in a view. [M]"""
+        return np.maximum(self.pdf(view.at.having(wo=wo)), 0)
+
     def _integrals(self, view: View) -> Cells | None:
         # around the mirror direction at all scales, where lobes may be that are not sampled
         scales = 10 ** self.rng.uniform(-4, 0, (600, 1))
-        mirrored = view.wi * [-1, -1, 1] + scales * self.rng.normal(size=(600, 3))
+        mirrored = view.at.wi * [-1, -1, 1] + scales * self.rng.normal(size=(600, 3))
         seeds = encode(np.concatenate([view.pilot, unit(mirrored)]))
-        most = max(len(view.u) // 4000, 8)
+        most = max(len(view.density) // 4000, 8)
         cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
-        crowd = np.bincount(cells.find(encode(view.pilot)), minlength=len(cells.start))
+        crowd = cells.counts(encode(view.pilot))
         crowded = (crowd * ((cells.level == DEPTH) & (crowd > 4 * most))).sum()
         # at the normal, all azimuths of the finest cells are one place
         radius = np.hypot(*view.pilot.T[:2])
         centre = (radius < np.sqrt(2) * 0.5**DEPTH).sum()
         if max(crowded, centre) > 0.01 * len(view.pilot):  # samples are closer together than the finest cells
             return None
-        integrals = integrate(
-            lambda wo: np.maximum(self.pdf(view.wi, wo, view.uv), 0),
-            cells,
-            self.rng,
-            view.codes,
-            np.ones(len(view.codes)),
-            view.count,
-        )
+        integrals = integrate(partial(self.density, view), cells, self.rng, view.codes, view.count)
         # samples in cells where fewer than two of the cell's points are expected within the lobe
-        cell = integrals.find(view.codes)
-        density = view.density[-view.count :]
-        weights = 1 / (view.count * density[density > 0])
-        covered = np.bincount(cell, weights, minlength=len(integrals.start))
+        density_there = view.density[-view.count :]
+        weights = 1 / (view.count * density_there[density_there > 0])
+        covered = integrals.counts(view.codes, weights)
         coarse = covered * POINTS < 2 * integrals.solid_angle
-        overlooked = coarse[cell].sum() / view.count
+        overlooked = integrals.counts(view.codes)[coarse].sum() / view.count
         known = integrals.mean.sum() > view.share or overlooked < OVERLOOKED
         return integrals if known else None
 
@@ -152,38 +141,32 @@ class Case(Subject, Probe):
         With ``value`` and ``pdf`` there, how far these change as directions are rounded (``value_off``,
         ``pdf_off``), and ``eta``, the index of refraction at wo over that at wi.
         """
-        count = self.count(2**13, 2**15)
-        wi = self.units(count)
-        uv = self.uniform(count, 2)
-        s = self.sample(wi, self.uniform(count, 3), uv)
-        usable = np.isfinite(s.wo).all(axis=1) & ~s.delta & s.lit
-        usable &= (self.rng.random(count) < 0.75) & ~narrow(wi, s)
+        s = self.sample(self.at_random(2**13, 2**15))
+        count = len(s.pdf)
+        usable = s.wo.any(axis=1) & ~s.delta & s.lit
+        usable &= (self.rng.random(count) < 0.75) & ~narrow(s)
         wo = unit(np.where(usable[:, None], s.wo, self.units(count)))
-        value, pdf = self.both(wi, wo, uv)
-        off = self.spread(lambda *at: np.column_stack(self.both(*at)), wi, wo, uv)
-        return Lanes(
-            wi=wi,
-            wo=wo,
-            uv=uv,
-            eta=_indices(wi, wo, np.where(usable, s.eta, np.nan)),
-            value=value,
-            pdf=pdf,
-            value_off=off[:, :-1],
-            pdf_off=off[:, -1],
-        )
+        eta = _indices(s.wi, wo, np.where(usable, s.eta, np.nan))
+        pairs = Lanes(wi=s.wi, wo=wo, uv=s.uv, eta=eta)
+        pairs.value, pairs.pdf = self.both(pairs)
+        off = self.spread(lambda moved: np.column_stack(self.both(moved)), pairs)
+        return pairs.having(value_off=off[:, :-1], pdf_off=off[:, -1])
 
     @cached_property
     def lit(self) -> Lanes:
         """The pairs with a value, away from the horizon, over which values jump."""
         p = self.pairs
         up = (abs(p.wo[:, 2]) > 0.05) & (abs(p.wi[:, 2]) > 0.05)
-        return p.only(up & np.isfinite(p.value).all(axis=1) & (p.value > 0).any(axis=1))
+        return p[up & np.isfinite(p.value).all(axis=1) & (p.value > 0).any(axis=1)]
 
-    def spread(
-        self, quantity: Callable[..., Array], wi: Array, wo: Array, uv: Array, *others: Array
-    ) -> Array:
-        """The largest change of ``quantity(wi, wo, uv, …)`` as directions move by a rounding."""
-        return probe.spread(lambda i, o: quantity(i, o, uv, *others), (wi, wo), self.rng)
+    def spread(self, quantity: Callable[[Lanes], Array], at: Lanes) -> Array:
+        """The largest change of a quantity as ``wi`` and ``wo`` move by a rounding."""
+        return probe.spread(lambda wi, wo: quantity(at.having(wi=wi, wo=wo)), (at.wi, at.wo), self.rng)
+
+
+def off_pairs(pairs: Lanes, value: Array, pdf: Array) -> Array:
+    """How far other values and densities at pairs are off theirs, relative, beyond rounding. [N]"""
+    return np.maximum(excess(value, pairs.value, pairs.value_off), excess(pdf, pairs.pdf, pairs.pdf_off))
 
 
 def _indices(wi: Array, wo: Array, eta: Array) -> Array:
@@ -196,28 +179,28 @@ def _indices(wi: Array, wo: Array, eta: Array) -> Array:
     return np.where(crosses, eta, 1)
 
 
-def live(wi: Array, s: Lanes, value: Array, pdf: Array) -> Array:
+def live(s: Lanes, value: Array, pdf: Array) -> Array:
     """Where samples come from lobes with a width and count for the density. [N], bool
 
     Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
     the value is 0 there, or that the weight is wrong; but then the stated density is that of the direction.
     """
-    crosses = wi[..., 2] * s.wo[:, 2] < 0
-    wrong = np.where(crosses, int(mi.BSDFFlags.Reflection), int(mi.BSDFFlags.Transmission))
-    astray = (s.type & wrong) != 0
+    crosses = s.wi[:, 2] * s.wo[:, 2] < 0
+    wrong = np.where(crosses, mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission)
+    astray = (s.flags & wrong) != 0
     dark = ~s.lit & (value != 0).any(axis=1)
     refused = dark & (astray | ~np.isclose(s.pdf, pdf, rtol=1e-3))
     return ~s.delta & np.isfinite(pdf) & (pdf > 0) & ~refused
 
 
-def narrow(wi: Array, s: Lanes) -> Array:
+def narrow(s: Lanes) -> Array:
     """Where samples are of a component whose lobe is narrower than rounded directions resolve. [N], bool"""
     drawn = ~s.delta & (s.pdf > 0)
     too_narrow = np.zeros(len(s.pdf), bool)
     # a lobe of width w along the plane of incidence is w cos θ wide across: density 1 / (w² cos θ)
-    sharpness = s.pdf / abs(wi[..., 2])
-    for component in np.unique(s.component[drawn]):
-        part = drawn & (s.component == component)
+    sharpness = s.pdf / abs(s.wi[:, 2])
+    for lobe in np.unique(s.lobe[drawn]):
+        part = drawn & (s.lobe == lobe)
         too_narrow |= part & (np.median(sharpness[part]) > NARROW**-2)
     return too_narrow
 
@@ -225,7 +208,7 @@ def narrow(wi: Array, s: Lanes) -> Array:
 def parameters(case: Case) -> Iterator[tuple[str, mi.Float]]:
     """Yield the parameters that hold floating-point numbers which are amounts."""
     params = mi.traverse(case.plugin)
-    for key in params.keys():  # noqa: SIM118 - SceneParameters is not a dict
+    for key in list(params.keys()):
         with suppress(TypeError):  # one that was left out is None, which Dr.Jit cannot read
             value = params[key]
             array = dr.is_array_v(value) and dr.is_float_v(value) and not dr.is_matrix_v(value)

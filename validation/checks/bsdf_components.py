@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
+from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, off_pairs, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
-from mrt_mitsuba.validation.checks.law import Law, Skip, at_most, figures, finds, most, number_of
+from mrt_mitsuba.validation.checks.law import Law, Skip, figures, finds, most, number_of
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, context, excess
 
 FLAGS = "print([hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())], hex(int(bsdf.flags())))\n"
@@ -49,13 +49,13 @@ def without_mask(size, ctx):
 
 
 @figures(
-    flags=at_most(
+    flags=most(
         "flags of the whole that no component has, or the other way around",
         0,
         "flags() is the union of flags(i)",
         FLAGS,
     ),
-    updated=at_most(
+    updated=most(
         "components more or fewer after params.update()", 0, "an update says nothing about lobes", UPDATED
     ),
     sum=most("sum of the components against the whole, relative", 1e-4, "a sum", VALUE),
@@ -63,7 +63,7 @@ def without_mask(size, ctx):
     samples=number_of(
         "results of sample() that contradict the flags of component {component}", 0, SIDES, FLAGS + SAMPLE
     ),
-    dark=at_most(
+    dark=most(
         "sides that a component's flags name, and from which it is black", 0, "a flag without a lobe", FLAGS
     ),
     masked=most(
@@ -88,7 +88,7 @@ def components(law: Law, case: Case) -> None:
         old = dict(parameters(case))
         mi.traverse(copy).update({key: type(value)(value) for key, value in old.items()})
         law.hold("updated", abs(copy.component_count() - len(flags)), keys=list(old))
-    parts = [case.eval(p.wi, p.wo, p.uv, context(i)) for i in range(len(flags))]
+    parts = [case.eval(p, context(i)) for i in range(len(flags))]
     law.hold("sum", excess(np.sum(parts, axis=0), p.value, p.value_off), p)
     dark = 0
     for i, (flag, value) in enumerate(zip(flags, parts, strict=True)):
@@ -101,37 +101,29 @@ def _component(law: Law, case: Case, i: int, flag: int, value: Array) -> int:
     """Hold values and samples of a component to its flags; the number of sides of these that are black."""
     p = case.pairs
     lit = (value != 0).any(axis=1)
-    with_width = flag & ~int(mi.BSDFFlags.Delta)
-    bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(with_width, p.wi, p.wo)
+    bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(flag & ~mi.BSDFFlags.Delta, p)
     law.hold("values", bad, p, component=i)
     # samples of one component that go by another name, kind or side
-    at = case.at_random(2**12, 2**14)
-    s = case.sample(at.wi, at.u, at.uv, context(i))
+    s = case.sample(case.at_random(2**12, 2**14), context(i))
     drawn = s.lit & np.isfinite(s.weight).all(axis=1)
-    bad = (s.component != i) | ((s.type & ~flag) != 0) | (s.type == 0)
-    bad |= (abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, at.wi, s.wo)
-    law.hold("samples", drawn & bad, at, component=i)
+    bad = (s.lobe != i) | ((s.flags & ~flag) != 0) | (s.flags == 0)
+    bad |= (abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, s)
+    law.hold("samples", drawn & bad, s, component=i)
     # sides that flags name and where there is no light, of a component that has some
-    z = np.concatenate([p.wi[lit, 2], at.wi[drawn, 2]])
+    z = np.concatenate([p.wi[lit, 2], s.wi[drawn, 2]])
     if not len(z):
         return 0
-    front = _has(flag, mi.BSDFFlags.FrontSide) and not (z > 0).any()
-    back = _has(flag, mi.BSDFFlags.BackSide) and not (z < 0).any()
+    front = mi.has_flag(flag, mi.BSDFFlags.FrontSide) and not (z > 0).any()
+    back = mi.has_flag(flag, mi.BSDFFlags.BackSide) and not (z < 0).any()
     return front + back
 
 
-def _has(flags: int, flag: mi.BSDFFlags) -> bool:
-    return bool(flags & int(flag))
-
-
-def _allowed(flags: int, wi: Array, wo: Array) -> Array:
-    """Where flags allow light. [N], bool"""
-    reflection = _has(flags, mi.BSDFFlags.Reflection)
-    transmission = _has(flags, mi.BSDFFlags.Transmission)
-    front = _has(flags, mi.BSDFFlags.FrontSide)
-    back = _has(flags, mi.BSDFFlags.BackSide)
-    same_side = wi[:, 2] * wo[:, 2] > 0
-    return np.where(same_side, reflection, transmission) & np.where(wi[:, 2] > 0, front, back)
+def _allowed(flags: int, at: Lanes) -> Array:
+    """Where flags allow light from ``wi`` to ``wo``. [N], bool"""
+    same_side = at.wi[:, 2] * at.wo[:, 2] > 0
+    way = np.where(same_side, mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission)
+    side = np.where(at.wi[:, 2] > 0, mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide)
+    return ((flags & way) != 0) & ((flags & side) != 0)
 
 
 def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
@@ -139,16 +131,15 @@ def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
     every = int(mi.BSDFFlags.All)
     kinds = [flag & every for flag in flags]
     p = case.pairs
-    at = Lanes(wi=p.wi, uv=p.uv, wo=p.wo)
-    few = case.few(at, 2**12, 2**13)
+    few = case.few(p, 2**12, 2**13)
     for mask in sorted({*kinds, *(every & ~kind for kind in kinds)} - {0}):
         ctx = context(type_mask=mask)
         chosen = [part for kind, part in zip(kinds, parts, strict=True) if kind & ~mask == 0]
         expected = np.sum([np.zeros_like(p.value), *chosen], axis=0)
-        value, pdf = case.both(p.wi, p.wo, p.uv, ctx)
-        law.hold("masked", excess(value, expected, p.value_off), at, mask=mask)
-        s = case.sample(few.wi, case.uniform(len(few.wi), 3), few.uv, ctx)
-        bad = s.lit & np.isfinite(s.weight).all(axis=1) & ((s.type & ~mask) != 0)
+        value, pdf = case.both(p, ctx)
+        law.hold("masked", excess(value, expected, p.value_off), p, mask=mask)
+        s = case.sample(few.having(u=case.uniform(len(few.wi), 3)), ctx)
+        bad = s.lit & np.isfinite(s.weight).all(axis=1) & ((s.flags & ~mask) != 0)
         if not chosen:
             bad |= pdf[: len(bad)] > 0
         law.hold("masked_samples", bad, few, mask=mask)
@@ -172,26 +163,22 @@ def variants(law: Law, case: Case) -> None:
     """Values are the same in the scalar variant, and in the spectral one where colours are grey."""
     here = mi.variant()
     case.with_()
-    finite = case.pairs.only(np.isfinite(case.pairs.value).all(axis=1))
-    few = case.few(finite, 200, 800)
+    few = case.few(case.pairs[np.isfinite(case.pairs.value).all(axis=1)], 200, 800)
     grey = np.ptp(few.value, axis=1).max() <= 1e-5 * few.value.max()
     others = [case.other_kind]
     if here.endswith("_rgb") and grey:
         others.append(here.replace("_rgb", "_spectral"))
     for other in others:
         try:
-            value, pdf = case.elsewhere(other, lambda: Probe(case.load()).both(few.wi, few.wo, few.uv))
+            value, pdf = case.elsewhere(other, lambda: Probe(case.load()).both(few))
         except Skip as reason:
             law.notes.append(str(reason))
             continue
-        expected = few.value
-        allowed = few.value_off
+        expected = few
         if not other.endswith("_rgb"):  # the mean of equal channels, however many there are
             value = value.mean(axis=1)
-            expected = expected.mean(axis=1)
-            allowed = allowed.max(axis=1)
-        error = np.maximum(excess(value, expected, allowed), excess(pdf, few.pdf, few.pdf_off))
-        law.hold("same", error, few, variants=(here, other), other=other, here=here)
+            expected = few.having(value=few.value.mean(axis=1), value_off=few.value_off.max(axis=1))
+        law.hold("same", off_pairs(expected, value, pdf), few, variants=(here, other), other=other, here=here)
 
 
 @figures(
@@ -213,6 +200,5 @@ def switch(law: Law, case: Case) -> None:
     if case.description is not None:
         candidates["loaded anew"] = case.load()
     for which, bsdf in candidates.items():
-        value, pdf = Probe(bsdf).both(few.wi, few.wo, few.uv)
-        error = np.maximum(excess(value, few.value, few.value_off), excess(pdf, few.pdf, few.pdf_off))
+        error = off_pairs(few, *Probe(bsdf).both(few))
         law.hold("same", error, few, which=which, other=other, variants=(here, other, here))

@@ -12,8 +12,8 @@ import numpy as np
 from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.bsdf_case import Case, affine, changed, live, narrow, parameters
 from mrt_mitsuba.validation.checks.faults import GLOSS, of_weight
-from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, at_most, figures, finds, most, number_of
-from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Lanes, Probe, as_mitsuba, context, excess
+from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, figures, finds, most, number_of
+from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
 IN_THE_MEAN = 5e-2  # where outlines of lobes move, derivatives of samples miss them
@@ -62,7 +62,7 @@ def steeper(size, value, *_):
 
 
 @figures(
-    values=at_most(
+    values=most(
         "derivative of values by {key}{how}, relative, beyond the error of differences",
         GRADIENT,
         f"{BIASED}; differences of two widths agree better, or the difference is allowed for",
@@ -74,14 +74,14 @@ def steeper(size, value, *_):
         "one of them spoils a whole gradient",
         DERIVATIVE,
     ),
-    mean=at_most(
+    mean=most(
         "mean derivative of weights by {key}, of directions that move with it, against that of "
         f"values, relative, beyond {SIGMAS} standard errors",
         IN_THE_MEAN,
         DETACHED,
         SAMPLED,
     ),
-    weights=at_most(
+    weights=most(
         "derivative of weights by {key} against that of eval() over a constant density, relative",
         GRADIENT,
         DETACHED,
@@ -105,7 +105,7 @@ def gradients(law: Law, case: Case) -> None:
         raise Skip("values are 0")
     case = case.copy()
     params = mi.traverse(case.plugin)
-    keys = [k for k, _ in parameters(case) if not params.flags(k) & int(mi.ParamFlags.NonDifferentiable)]
+    keys = [k for k, _ in parameters(case) if not params.flags(k) & mi.ParamFlags.NonDifferentiable]
     if not keys:
         raise Skip("traverse() marks no parameter as differentiable")
     for key in keys:
@@ -137,7 +137,7 @@ def _attached(law: Law, case: Case, key: str) -> bool:
     measured = beyond / max(abs(slope)[usual].sum(), abs(derivative)[usual].sum(), 1e-30)
     i = int(np.where(usual, off, 0).argmax())
     how = "" if attached else " (detached)"
-    law.hold("values", measured, few.only(i), key=key, how=how)
+    law.hold("values", measured, few[i], key=key, how=how)
     law.hold("broken", broken, few, key=key)
     return attached or measured <= GRADIENT
 
@@ -164,10 +164,9 @@ def _sampled(law: Law, case: Case, key: str) -> None:
     change otherwise: only means over smooth light are then the same.
     """
     at = case.at_random(2**14, 2**16)
-    wi = at.wi
 
     def weights() -> list[mi.Float]:
-        si = probe.interaction(as_mitsuba("Vector3f", wi), as_mitsuba("Point2f", at.uv))
+        si = probe.interaction(as_mitsuba("Vector3f", at.wi), as_mitsuba("Point2f", at.uv))
         sample1 = as_mitsuba("Float", at.u[:, 0])
         sample2 = as_mitsuba("Point2f", at.u[:, 1:])
         bs, weight = case.plugin.sample(context(), si, sample1, sample2)
@@ -177,11 +176,10 @@ def _sampled(law: Law, case: Case, key: str) -> None:
         by_value = _total(value) / fixed
         return [_total(weight) * light, by_value * dr.detach(light), dr.sum(bs.wo)]
 
-    (derivative, expected, moves), attached = _derivatives(case, key, len(wi), weights)
-    s = case.sample(wi, at.u, at.uv)
-    value, pdf = case.both(wi, np.nan_to_num(s.wo), at.uv)
-    counts = live(wi, s, value, pdf) & ~narrow(wi, s)
-    counts &= np.isfinite(derivative) & np.isfinite(expected) & (abs(wi[:, 2]) > 0.05)
+    (derivative, expected, moves), attached = _derivatives(case, key, len(at.wi), weights)
+    s = case.sample(at)
+    counts = live(s, *case.both(s)) & ~narrow(s)
+    counts &= np.isfinite(derivative) & np.isfinite(expected) & (abs(s.wi[:, 2]) > 0.05)
     counts &= (abs(s.wo[:, 2]) > 0.05) & (s.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
     if not attached or counts.sum() < 100:
         return
@@ -197,7 +195,7 @@ def _sampled(law: Law, case: Case, key: str) -> None:
         figure = "weights"
         known = abs(known)
         off = known[known <= np.quantile(known, 0.98)].mean()
-    law.hold(figure, off / size, at.only(i), key=key)
+    law.hold(figure, off / size, at[i], key=key)
 
 
 def _total(spectrum: mi.Spectrum) -> mi.Float:
@@ -217,9 +215,9 @@ def _reached(law: Law, case: Case, key: str) -> None:
         other = Probe(case.load(**{name: number}))
     except RuntimeError:  # what is loaded goes by another name, or takes other numbers
         return
-    value = other.eval(few.wi, few.wo, few.uv)
+    value = other.eval(few)
     off = excess(value, few.value, few.value_off)
-    law.hold("reached", off, Lanes(**{**vars(few), "value": value}), key=key, number=number)
+    law.hold("reached", off, few.having(value=value), key=key, number=number)
 
 
 def _moved(old: mi.Float, shift: mi.Float) -> mi.Float:

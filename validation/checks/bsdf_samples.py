@@ -22,7 +22,17 @@ from mrt_mitsuba.validation.checks.faults import (
     put,
     smaller,
 )
-from mrt_mitsuba.validation.checks.law import SIGMAS, Law, figures, finds, most, number_of, rare, share_of
+from mrt_mitsuba.validation.checks.law import (
+    FEWEST,
+    SIGMAS,
+    Law,
+    figures,
+    finds,
+    most,
+    number_of,
+    rare,
+    share_of,
+)
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
 from mrt_mitsuba.validation.checks.sphere import (
     Cells,
@@ -119,7 +129,7 @@ def sampling(law: Law, case: Case) -> None:
     if not judged:
         law.notes.append(f"{UNRESOLVED} at every angle")
         return
-    at = case.incidence.only([cells is not None for cells in case.densities])
+    at = case.incidence[[cells is not None for cells in case.densities]]
     tests = []  # [angles, 6, 2]
     worst = []
     beyond = []
@@ -133,7 +143,7 @@ def sampling(law: Law, case: Case) -> None:
     chances = stats.chi2.sf(by_angle[..., 0], by_angle[..., 1])
     chance = sidak(chances.min(), chances.size)
     i = chances[:-1].min(axis=1).argmin()
-    law.hold("cells", chance, at.only(i), cell=worst[i], angles=len(judged))
+    law.hold("cells", chance, at[i], cell=worst[i], angles=len(judged))
     law.hold("integral", np.maximum(beyond, 0), at)
     broad = [view for view in case.views if 0 < view.density.max() < BROAD]
     if broad and not case.quick and not is_scalar():
@@ -144,17 +154,15 @@ def sampling(law: Law, case: Case) -> None:
 
 def _nudged(law: Law, case: Case) -> None:
     """Of three random numbers, two at least lead to another direction when they move a little."""
-    drawn, at = case.drawn
-    u = at.u
-    changes = np.zeros(len(u), int)
-    for number in range(3):
-        moved = u.copy()
-        moved[:, number] += np.where(u[:, number] < 0.5, NUDGE, -NUDGE)
-        wo = case.sample(at.wi, moved, at.uv).wo
+    drawn = case.drawn
+    changes = np.zeros(len(drawn.u), int)
+    for number in np.eye(3, dtype=np.float32):
+        moved = drawn.u + number * np.where(drawn.u < 0.5, NUDGE, -NUDGE)
+        wo = case.sample(drawn.having(u=moved)).wo
         changes += (wo != drawn.wo).any(axis=1)
-    smooth = drawn.lit & ~drawn.delta & (drawn.pdf < BROAD) & np.isfinite(drawn.wo).all(axis=1)
-    if smooth.sum() >= 20:
-        law.hold("still", (changes < 2)[smooth], at.only(smooth))
+    smooth = drawn.lit & ~drawn.delta & (drawn.pdf < BROAD) & drawn.wo.any(axis=1)
+    if smooth.sum() >= FEWEST:
+        law.hold("still", (changes < 2)[smooth], drawn[smooth])
 
 
 def _without_density(law: Law, case: Case) -> None:
@@ -162,8 +170,8 @@ def _without_density(law: Law, case: Case) -> None:
     count = case.count(2**14, 2**18)
     rng = np.random.default_rng((case.seed, count))
     wi, wo = probe.unit(rng.normal(size=(2, count, 3)))
-    uv = rng.random((count, 2), np.float32)
-    law.hold("dark", probe.without_density(*case.both(wi, wo, uv)), wi=wi, wo=wo, uv=uv)
+    at = Lanes(wi=wi, wo=wo, uv=rng.random((count, 2), np.float32))
+    law.hold("dark", probe.without_density(*case.both(at)), at)
 
 
 def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
@@ -172,13 +180,13 @@ def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
     expected = np.zeros(len(cells.start))
     variance = np.zeros(len(cells.start))
     for view in views:
-        seen += cells.counts(view.samples.wo[view.density > 0])
-        share, doubt = cells.integrals(partial(case.pdf, view.wi, uv=view.uv), case.rng)
+        seen += cells.counts(encode(view.samples.wo[view.density > 0]))
+        share, doubt = cells.integrals(partial(case.density, view), case.rng)
         count = len(view.density)
         expected += count * share[:, 0]
         variance += count**2 * doubt[:, 0]
-    view = max(views, key=lambda v: v.wi[2])
-    hold_small(law, cells, seen, expected, variance, FIT, wi=view.wi, uv=view.uv)
+    view = max(views, key=lambda v: v.at.wi[2])
+    hold_small(law, cells, seen, expected, variance, FIT, view.at)
 
 
 def weight_in_stairs(size, weight, u):
@@ -211,32 +219,31 @@ def weights(law: Law, case: Case) -> None:
 
     Of lobes of one direction, the density is the probability with which they are drawn.
     """
-    drawn, at = case.drawn
-    pairs = at.wi, np.where(np.isfinite(drawn.wo), drawn.wo, 1), at.uv
-    counts = live(at.wi, drawn, *case.both(*pairs)) | drawn.lit & ~drawn.delta
-    few = slice(0, len(drawn.pdf) // len(case.views))
-    counts &= ~np.concatenate([narrow(view.wi, view.samples.only(few)) for view in case.views])
+    drawn = case.drawn
+    counts = live(drawn, *case.both(drawn)) | drawn.lit & ~drawn.delta
+    few = len(drawn.pdf) // len(case.views)
+    counts &= ~np.concatenate([narrow(view.samples[:few]) for view in case.views])
 
-    def ratio(i: Array, o: Array, t: Array) -> Array:
-        value, pdf = case.both(i, o, t)
+    def ratio(at: Lanes) -> Array:
+        value, pdf = case.both(at)
         return value / np.where(pdf > 0, pdf, np.inf)[:, None]
 
     for name, stated, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
-        error = excess(stated, function(*pairs), case.spread(function, *pairs))
-        law.hold(name, np.where(counts, error, 0), at)
+        error = excess(stated, function(drawn), case.spread(function, drawn))
+        law.hold(name, error, drawn, where=counts)
     errors = []
     angles = []
     for i, view in enumerate(case.views):
         s = view.samples
-        lobe = s.component * 4096 + s.type
-        for one in np.unique(lobe[s.delta & s.lit]):  # of one direction
-            here = s.delta & (lobe == one)
+        kind = s.lobe * 4096 + s.flags
+        for one in np.unique(kind[s.delta & s.lit]):  # of one direction
+            here = s.delta & (kind == one)
             stated = float(np.nan_to_num(s.pdf[here].mean()))
             sigma = np.sqrt(max(stated * (1 - stated), 0) / len(here))
             errors.append(max(abs(here.mean() - stated) - SIGMAS * sigma, 0))
             angles.append(i)
     if errors:
-        law.hold("discrete", errors, case.incidence.only(angles))
+        law.hold("discrete", errors, case.incidence[angles])
 
 
 def too_bright(size, value, *_):
@@ -271,18 +278,19 @@ def energy(law: Law, case: Case) -> None:
     phi = case.rng.uniform(0, 2 * np.pi, len(GRAZING))
     wi = probe.direction(np.cos(np.radians(GRAZING)), phi)
     uv = case.uniform(len(GRAZING), 2)
+    grazing = Lanes(wi=wi, uv=uv)
     means = []
-    for i, t in zip(wi, uv, strict=True):
-        s = case.sample(i, case.uniform(count, 3), t, mode)
+    for i in range(len(GRAZING)):
+        s = case.sample(grazing[i].having(u=case.uniform(count, 3)), mode)
         means.append(_mean(s.weight))
     apart = []
     for view, cells in zip(case.views, case.densities, strict=True):
-        s = case.sample(view.wi, view.u, view.uv, mode)
+        s = case.sample(view.samples, mode)
         means.append(_mean(s.weight))
         # where values are NaN, the law ``finite`` says so
         apart.append(_apart(case, view, cells, s) if cells and view.holes < 0.01 else 0)
     surely = [(mean - SIGMAS * error).max() for mean, error in means]
-    law.hold("largest", surely, joined([Lanes(wi=wi, uv=uv), case.incidence]))
+    law.hold("largest", surely, joined([grazing, case.incidence]))
     if any(case.densities):
         law.hold("apart", apart, case.incidence)
 
@@ -296,15 +304,11 @@ def _mean(weight: Array) -> tuple[Array, Array]:
 def _apart(case: Case, view: View, cells: Cells, s: Lanes) -> float:
     """How far the albedo of samples and the integral of eval() differ, beyond chance, relative."""
     smooth = np.where(s.delta[:, None], 0, probe.finite_or_0(s.weight))
-    mode = context(importance=True)
-    integrals = integrate(
-        lambda wo: case.eval(view.wi, wo, view.uv, mode),
-        cells,
-        case.rng,
-        encode(s.wo),
-        smooth[:, 0],
-        len(smooth),
-    )
+
+    def value(wo: Array) -> Array:
+        return case.eval(view.at.having(wo=wo), context(importance=True))
+
+    integrals = integrate(value, cells, case.rng, encode(s.wo), len(smooth), smooth[:, 0])
     by_samples, error = _mean(smooth)
     by_quadrature = integrals.mean.sum(axis=0)
     sigma = np.sqrt(error**2 + integrals.variance.sum(axis=0))

@@ -23,17 +23,17 @@ from mrt_mitsuba.validation.checks.faults import (
     put,
 )
 from mrt_mitsuba.validation.checks.law import (
+    FEWEST,
     Figure,
     Law,
     Skip,
     at_least,
-    at_most,
     figures,
     finds,
     most,
     number_of,
 )
-from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar
+from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar, unit
 from mrt_mitsuba.validation.checks.subject import judge_many
 
 TWO_WAYS = "two ways to the same number"
@@ -68,7 +68,7 @@ def eval_pdf(law: Law, case: Case) -> None:
     """
     case.need_smooth()
     p = case.pairs
-    value, pdf = case.pair(p.wi, p.wo, p.uv)
+    value, pdf = case.pair(p)
     law.hold("value", excess(value, p.value, p.value_off), p)
     law.hold("density", excess(pdf, p.pdf, p.pdf_off), p)
 
@@ -78,7 +78,7 @@ def eval_pdf(law: Law, case: Case) -> None:
         return [case.plugin.eval(ctx, si, wo, no_lane), together]
 
     if not is_scalar():  # where Mitsuba takes ``active`` out of its plugins
-        values = case.ask(switched_off, p.wi, p.wo, p.uv)
+        values = case.ask(switched_off, p)
         law.hold("inactive", np.any(values, axis=(0, 2)), p)
 
 
@@ -146,62 +146,58 @@ def reciprocity(law: Law, case: Case) -> None:
 
     E. Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, § 5.2.
     """
-    few = case.pairs.only(abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3)
-    pairs = few.wi, few.wo, few.uv, few.eta
+    pairs = case.pairs[abs(case.pairs.wi[:, 2] * case.pairs.wo[:, 2]) > 1e-3]
 
-    def forth(i: Array, o: Array, t: Array, eta: Array) -> Array:
-        return case.eval(i, o, t) / abs(o[:, 2:]) * eta[:, None] ** 2
+    def forth(at: Lanes) -> Array:
+        return case.eval(at) / abs(at.wo[:, 2:]) * at.eta[:, None] ** 2
 
-    def back(i: Array, o: Array, t: Array, _: Array) -> Array:
-        return case.eval(o, i, t) / abs(i[:, 2:])
+    def back(at: Lanes) -> Array:
+        return case.eval(at.having(wi=at.wo, wo=at.wi)) / abs(at.wi[:, 2:])
 
-    def importance(i: Array, o: Array, t: Array, _: Array) -> Array:
-        return case.eval(i, o, t, context(importance=True)) / abs(o[:, 2:])
+    def importance(at: Lanes) -> Array:
+        return case.eval(at, context(importance=True)) / abs(at.wo[:, 2:])
 
-    value = forth(*pairs)
-    allowed = case.spread(forth, *pairs)
+    value = forth(pairs)
+    allowed = case.spread(forth, pairs)
     for name, other in (("swapped", back), ("modes", importance)):
-        error = excess(value, other(*pairs), allowed + case.spread(other, *pairs))
-        law.hold(name, error, few)
+        error = excess(value, other(pairs), allowed + case.spread(other, pairs))
+        law.hold(name, error, pairs)
     _delta_either_way(law, case)
     # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
-    s, at = case.drawn
-    reflected = ((s.type & int(mi.BSDFFlags.Reflection)) != 0) & s.lit
+    s = case.drawn
+    reflected = ((s.flags & mi.BSDFFlags.Reflection) != 0) & s.lit
     if reflected.any():
-        off = np.nan_to_num(abs(s.eta - 1), nan=np.inf)
-        law.hold("medium", np.where(reflected, off, 0), at)
+        law.hold("medium", abs(s.eta - 1), s, where=reflected)
 
 
 def _delta_either_way(law: Law, case: Case) -> None:
     """Lobes of one direction: probability × weight × η² of a sample, and of the one that goes back."""
     at = case.at_random(2**13, 2**15)
     at.back = case.uniform(len(at.wi), 3)
-    wi = at.wi
-    forth = case.sample(wi, at.u, at.uv)
-    wo = probe.unit(np.where(np.isfinite(forth.wo), forth.wo, 1))
-    back = case.sample(wo, at.back, at.uv)
-    same = forth.delta & (forth.type == back.type) & (forth.component == back.component)
-    same &= abs(wi[:, 2] * wo[:, 2]) > 1e-3
-    returned = (abs(probe.unit(back.wo) - wi) < 1e-3).all(axis=1)
-    if same.sum() < 20:
+    forth = case.sample(at)
+    there = at.having(wo=unit(forth.wo))
+    and_back = there.having(wi=there.wo, wo=at.wi, u=at.back)
+    back = case.sample(and_back)
+    same = forth.delta & (forth.flags == back.flags) & (forth.lobe == back.lobe)
+    same &= abs(at.wi[:, 2] * there.wo[:, 2]) > 1e-3
+    returned = (abs(unit(back.wo) - at.wi) < 1e-3).all(axis=1)
+    if same.sum() < FEWEST:
         return
     lost = (same & ~returned).argmax()
-    law.hold("returns", returned[same].mean(), at.only(lost))
+    law.hold("returns", returned[same].mean(), at[lost])
 
-    def followed(i: Array, _: Array, t: Array, u: Array) -> Array:
-        s = case.sample(i, u, t)
+    def followed(at: Lanes) -> Array:
+        s = case.sample(at)
         return s.weight * (s.pdf * np.float64(s.eta) ** 2)[:, None]
 
-    there = wi, wo, at.uv, at.u
-    and_back = wo, wi, at.uv, at.back
     # next to total reflection, a rounding of the direction is a percent of what is transmitted
-    allowed = case.spread(followed, *there) + case.spread(followed, *and_back)
-    error = excess(followed(*there), followed(*and_back), allowed)
-    law.hold("single", np.where(same & returned, error, 0), at)
-    other = case.sample(wi, at.u, at.uv, context(importance=True))  # by the same random numbers
+    allowed = case.spread(followed, there) + case.spread(followed, and_back)
+    error = excess(followed(there), followed(and_back), allowed)
+    law.hold("single", error, at, where=same & returned)
+    other = case.sample(at, context(importance=True))  # by the same random numbers
     alike = forth.delta & (abs(other.wo - forth.wo) < 1e-3).all(axis=1)
     error = excess(forth.weight * forth.eta[:, None] ** 2, other.weight)
-    law.hold("single_modes", np.where(alike, error, 0), at)
+    law.hold("single_modes", error, at, where=alike)
 
 
 # A dot product of float32 vectors is rarely less than 1e-7
@@ -209,7 +205,7 @@ COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
 AZIMUTHS = (0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4)
 INDICES = ("eta", "k", "int_ior", "ext_ior")
 UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
-WRONG = "results not finite, or negative{where}: {faults}"
+WRONG = "results not finite, or negative{changed}: {faults}"
 SPOILS = "one such number spoils a picture"
 
 
@@ -228,7 +224,7 @@ def negative_next_to_normal(size, value, ctx, wi, wo):
 @figures(
     values=number_of(WRONG, 0, SPOILS, VALUE),
     samples=number_of(WRONG, 0, SPOILS, SAMPLE),
-    million=at_most(
+    million=most(
         "samples of {count} at random that are not finite, or negative, or of directions not of length 1",
         0,
         SPOILS,
@@ -278,14 +274,13 @@ def _ends(key: str, number: float) -> tuple[float, float]:
 
 def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None = None) -> bool:
     """Hold the faults of values, or those of samples where values have none; return whether all is sound."""
-    value, pdf = case.both(at.wi, at.wo, at.uv)
-    value_of_pair, pdf_of_pair = case.pair(at.wi, at.wo, at.uv)
-    s = case.sample(at.wi, at.u, at.uv)
+    value, pdf = case.both(at)
+    s = case.sample(at)
     length = np.linalg.norm(np.float64(s.wo), axis=1)
     values = {
         "eval()": _bad(value),
         "pdf()": _bad(pdf),
-        "eval_pdf()": _bad(value_of_pair) | _bad(pdf_of_pair),
+        "eval_pdf()": np.any([_bad(values) for values in case.pair(at)], axis=0),
     }
     samples = {
         "weights of samples": _bad(s.weight),
@@ -296,10 +291,10 @@ def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None =
     kinds = values if wrong_values else samples
     words = ", ".join(f"{kind} {faults.sum()}" for kind, faults in kinds.items() if faults.any())
     if words or not setting:
-        where = f" with {setting[0]} = {setting[1]:g}" if setting else ""
+        changed = f" with {setting[0]} = {setting[1]:g}" if setting else ""
         name = "values" if wrong_values else "samples"
         faults = np.any([*kinds.values()], axis=0)
-        law.hold(name, faults, at, setting=setting, where=where, faults=words or "none")
+        law.hold(name, faults, at, setting=setting, changed=changed, faults=words or "none")
     return not words
 
 
@@ -351,24 +346,24 @@ def roundoff(law: Law, case: Case) -> None:
     p = case.pairs
     steep = (abs(p.wi[:, 2]) > 0.1) & (abs(p.wo[:, 2]) > 0.1)
     # far off a lobe, an exponent of 40 makes 40 roundings of one: of nothing
-    lit = p.only(steep & (p.pdf > 1e-3) & (p.value.max(axis=1) > 1e-20))
-    few = case.few(lit, 500, 2000)
-    if len(few.pdf) < 20:
+    few = case.few(p[steep & (p.pdf > 1e-3) & (p.value.max(axis=1) > 1e-20)], 500, 2000)
+    if len(few.pdf) < FEWEST:
         raise Skip("too few pairs of directions with a value")
     inputs = np.concatenate([few.wi, few.wo], axis=1)
 
     def both_unit(x: Array) -> Array:
-        return probe.unit(x.reshape(-1, 2, 3).astype(np.float64)).reshape(-1, 6)
+        return unit(x.reshape(-1, 2, 3).astype(np.float64)).reshape(-1, 6)
 
-    def brightest(wi: Array, wo: Array, uv: Array) -> Array:
-        return case.eval(wi, wo, uv).max(axis=1)
+    def brightest(at: Lanes) -> Array:
+        return case.eval(at).max(axis=1)
 
     for name, function in (("eval", brightest), ("pdf", case.pdf)):
 
-        def at(x: Array, function: Callable[..., Array] = function) -> Array:
-            return function(x[:, :3], x[:, 3:], np.tile(few.uv, (len(x) // len(few.uv), 1)))
+        def values(x: Array, function: Callable[[Lanes], Array] = function) -> Array:
+            uv = np.tile(few.uv, (len(x) // len(few.uv), 1))
+            return function(Lanes(wi=x[:, :3], wo=x[:, 3:], uv=uv))
 
-        estimate = noise.measure(at, inputs, seed=case.seed, project=both_unit)
+        estimate = noise.measure(values, inputs, seed=case.seed, project=both_unit)
         if np.isnan(estimate.noise).mean() > 0.25:
             raise Skip("values change too fast for float32 steps to tell noise")
         law.hold("lost", estimate.lost, few, function=name, stride=estimate.stride)

@@ -19,7 +19,6 @@ from mrt_mitsuba.validation.checks.faults import DEGREE, PLACE, larger, no_numbe
 from mrt_mitsuba.validation.checks.law import (
     Law,
     Skip,
-    at_most,
     figures,
     finds,
     laws_in,
@@ -197,7 +196,7 @@ def density(law: Law, case: Case) -> None:
     judged = s.lit & ~s.delta
     if not judged.any():
         raise Skip("light comes from single directions (delta), or none was sampled")
-    law.hold("same", excess(s.pdf, s.again, case.spread[0])[judged])
+    law.hold("same", excess(s.pdf, s.again, case.spread[0]), where=judged)
 
 
 def in_hole(size, d):
@@ -254,7 +253,7 @@ def sampling(law: Law, case: Case) -> None:
     points = np.float64(case.points)
     scale = abs(s.dist) + abs(points).max(axis=1)
     off = norm(s.p - points - s.dist[:, None] * s.d, axis=1)
-    law.hold("place", np.nan_to_num((off / scale)[s.lit]))
+    law.hold("place", np.nan_to_num(off / scale), where=s.lit)
     if not case.around:
         law.notes.append("directions to surfaces are judged with their shapes")
         return
@@ -263,7 +262,7 @@ def sampling(law: Law, case: Case) -> None:
     pilot = codes[: count // 4]
     codes = codes[count // 4 :]
     cells = Cells.around(pilot, max(len(pilot) // 1000, 8))
-    integrals = integrate(case.density, cells, case.rng, codes, np.ones(len(codes)), len(codes))
+    integrals = integrate(case.density, cells, case.rng, codes, len(codes))
     tests, _ = chi_square(integrals, codes, len(codes))
     chances = stats.chi2.sf(*tests.T)
     law.hold("counts", sidak(chances.min(), len(chances)))
@@ -282,12 +281,12 @@ def _in_small_cells(law: Law, case: Case) -> None:
     rng = np.random.default_rng((case.seed, 3))
     seen = np.zeros(len(cells.start))
     for _ in range(count // 2**20):
-        seen += cells.counts(_directions(case, rng.random((2**20, 2), np.float32)))
+        seen += cells.counts(encode(_directions(case, rng.random((2**20, 2), np.float32))))
     share, variance = cells.integrals(case.density, rng)
     # a corner of a bright texel may lie between the points of a cell
     doubtful = chances_of(seen, count * share[:, 0], count**2 * variance[:, 0], SAME) < DOUBT
     if doubtful.any():
-        again = [cells.only(doubtful).integrals(case.density, rng) for _ in range(REPEATS)]
+        again = [cells[doubtful].integrals(case.density, rng) for _ in range(REPEATS)]
         share[doubtful], variance[doubtful] = np.mean(again, axis=0)
     hold_small(law, cells, seen, count * share[:, 0], count**2 * variance[:, 0], SAME)
 
@@ -317,15 +316,15 @@ def weights(law: Law, case: Case) -> None:
     counts = s.lit & (s.pdf > 0) & np.isfinite(s.weight).all(axis=1)
     if not counts.any():
         raise Skip("no sample carries light")
-    law.hold("weight", excess(s.weight * s.pdf[:, None], s.value, allowed)[counts])
+    law.hold("weight", excess(s.weight * s.pdf[:, None], s.value, allowed), where=counts)
     if case.around:
         _, value = case.seen(s.d)
-        law.hold("seen", excess(value, s.value, allowed)[counts])
+        law.hold("seen", excess(value, s.value, allowed), where=counts)
 
 
 @figures(
     bad=number_of("samples that are not finite, or negative, or not of unit length", 0, SPOILS),
-    million=at_most(
+    million=most(
         "samples of {count} from one point that are not finite, or negative, or whose direction is not of "
         "length 1",
         0,

@@ -22,6 +22,7 @@ from mrt_mitsuba.validation.tools.study import Bound
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
 ONE_IN_A_MILLION = "one false alarm in a million checks"
 SIGMAS = 6  # the same for a normal distribution: 2e-9
+FEWEST = 20  # errors of which a quantile says something
 NOWHERE = Lanes()
 Found = TypeVar("Found")
 Description = dict[str, Any]  # of a plugin, as ``mi.load_dict`` takes it
@@ -37,9 +38,10 @@ class Skip(Exception):
 class Figure:
     """What a law measures, and the limit that it is held to.
 
-    ``statistic``: a number "at most" or "at least" the limit; or, of N errors, the "most", the "count" or the
-    "share" of those that are wrong, or a quantile (a float) without NaN. ``what`` and ``snippet``, the body
-    of a program that shows the worst case, have places for the names given to ``Law.hold``.
+    ``statistic``: a number "at least" the limit; or, of one or N errors, the "most", the "count" or the
+    "share" of those that are wrong, or a quantile (a float) without NaN: at most the limit. ``what`` and
+    ``snippet``, the body of a program that shows the worst case, have places for the names given to
+    ``Law.hold``.
     """
 
     statistic: str | float
@@ -49,8 +51,10 @@ class Figure:
     snippet: str = ""
 
 
+STATISTICS: dict[str | float, Callable[..., float]]
+STATISTICS = {"at least": np.min, "most": np.max, "count": np.sum, "share": np.mean}
+
 # A figure by its statistic: what it is, its limit, the reason for that, and a snippet
-at_most = partial(Figure, "at most")
 at_least = partial(Figure, "at least")
 most = partial(Figure, "most")
 number_of = partial(Figure, "count")
@@ -137,27 +141,33 @@ class Law:
     program: Callable[..., str] | None = None  # writes snippets, while the law is checked
 
     def hold(
-        self, name: str, measured: ArrayLike, at: Lanes = NOWHERE, *, limit: float | None = None, **names: Any
+        self,
+        name: str,
+        measured: ArrayLike,
+        at: Lanes = NOWHERE,
+        *,
+        where: ArrayLike = True,
+        limit: float | None = None,
+        **names: Any,
     ) -> None:
         """Hold a figure, a number or N errors, to its limit.
 
         ``at`` and ``names`` fill its words and its snippet: values, or arrays that have a row for each error.
+        ``where``: which errors count. A quantile of fewer than ``FEWEST`` says nothing, and is left out.
         """
         figure = self.figures[name]
-        errors = np.asarray(measured, np.float64)
-        names = vars(at) | names
-        if figure.statistic in ("at most", "at least"):
-            amount = float(errors)
+        statistic = STATISTICS.get(figure.statistic)
+        errors = np.where(where, np.asarray(measured, np.float64), 0 if statistic else np.nan)
+        worst = np.where(np.isnan(errors), np.inf, errors).argmax()
+        if statistic:
+            amount = statistic(errors)
+        elif np.count_nonzero(~np.isnan(errors)) < FEWEST:
+            return
         else:
-            worst = np.where(np.isnan(errors), np.inf, errors).argmax()
-            amount = errors[worst]
-            if figure.statistic == "count":
-                amount = errors.sum()
-            elif figure.statistic == "share":
-                amount = errors.mean()
-            elif isinstance(figure.statistic, float):
-                amount = np.nanquantile(errors, figure.statistic)
-                worst = np.nanargmin(abs(errors - amount))
+            amount = np.nanquantile(errors, float(figure.statistic))
+            worst = np.nanargmin(abs(errors - amount))
+        names = vars(at) | names
+        if errors.ndim:
             names = {key: x[worst] if isinstance(x, np.ndarray) else x for key, x in names.items()}
         snippet = ""
         if self.program and figure.snippet:

@@ -22,9 +22,13 @@ Call = Callable[..., Any]  # its values are a Dr.Jit array, or several
 class Lanes(SimpleNamespace):
     """Arrays by name that have a row for each of N lanes."""
 
-    def only(self: Part, keep: Any) -> Part:
-        """Some of the lanes."""
+    def __getitem__(self: Part, keep: Any) -> Part:
+        """Some of the lanes, as of an array."""
         return type(self)(**{name: column[keep] for name, column in vars(self).items()})
+
+    def having(self: Part, **columns: Array) -> Part:
+        """The same lanes with some columns more, or in place of others."""
+        return type(self)(**{**vars(self), **columns})
 
 
 def joined(parts: Sequence[Part]) -> Part:
@@ -85,82 +89,70 @@ def at_wavelengths(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     return si
 
 
-def stratified(count: int, seed: int) -> Callable[[], mi.Float]:
-    """A source of random numbers in ``count`` lanes, a power of two: each call has one in every 1 / count.
-
-    So a fault in a slice of any one of them is met, if it is wider than two of these parts.
-    """
-    jitter = mi.PCG32(count, initstate=dr.opaque(mi.UInt64, seed))  # no part of a kernel depends on the seed
-    multipliers = np.random.default_rng(seed)
-    lane = dr.arange(mi.UInt32, count)
-
-    def draw() -> mi.Float:
-        part = lane
-        for _ in range(3):  # a permutation: each step can be undone
-            odd = 2 * int(multipliers.integers(2**30)) + 1
-            part = (part * dr.opaque(mi.UInt32, odd)) & (count - 1)
-            part ^= part >> (count.bit_length() // 2)
-        number = (mi.Float(part) + jitter.next_float32()) / count
-        return dr.minimum(number, dr.one_minus_epsilon(mi.Float))
-
-    return draw
-
-
 class Probe:
-    """Calls one BSDF: wi [N, 3] or [3] and wo [N, 3] in its frame, uv [N, 2] or [2], u [N, 3]."""
+    """Asks one BSDF about lanes: ``wi`` and ``wo`` [N, 3] in its frame, ``uv`` [N, 2], ``u`` [N, 3].
+
+    Of ``wi`` and ``uv`` there may be one for all lanes.
+    """
 
     def __init__(self, bsdf: mi.BSDF) -> None:
         self.plugin = bsdf
 
-    def ask(
-        self, call: Call, wi: Array, wo: Array, uv: Array, ctx: mi.BSDFContext | None = None
-    ) -> list[Array]:
-        """The values of ``call(context, interaction, wo)``, as arrays."""
-        count = len(wo)
-        wi = np.broadcast_to(wi, (count, 3))
-        uv = np.broadcast_to(uv, (count, 2))
+    def ask(self, call: Call, at: Lanes, ctx: mi.BSDFContext | None = None, given: str = "wo") -> list[Array]:
+        """The values of ``call(context, interaction, wo)``, or of another column ``given``, as arrays."""
+        third = vars(at)[given]
+        count = len(third)
+        wi = np.broadcast_to(at.wi, (count, 3))
+        uv = np.broadcast_to(at.uv, (count, 2))
 
-        def at(i: mi.Vector3f, t: mi.Point2f, o: mi.Vector3f) -> Any:
+        def values(i: mi.Vector3f, t: mi.Point2f, o: mi.Vector3f) -> Any:
             return call(ctx or context(), interaction(i, t), o)
 
-        return lanes(at, ("Vector3f", wi), ("Point2f", uv), ("Vector3f", wo))
+        return lanes(values, ("Vector3f", wi), ("Point2f", uv), ("Vector3f", third))
 
-    def eval(self, wi: Array, wo: Array, uv: Array, ctx: mi.BSDFContext | None = None) -> Array:
+    def eval(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> Array:
         """f |cos θo|. [N, channels]"""
-        return self.ask(self.plugin.eval, wi, wo, uv, ctx)[0]
+        return self.ask(self.plugin.eval, at, ctx)[0]
 
-    def pdf(self, wi: Array, wo: Array, uv: Array, ctx: mi.BSDFContext | None = None) -> Array:
+    def pdf(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> Array:
         """The density per solid angle. [N]"""
-        return self.ask(self.plugin.pdf, wi, wo, uv, ctx)[0]
+        return self.ask(self.plugin.pdf, at, ctx)[0]
 
-    def both(self, wi: Array, wo: Array, uv: Array, ctx: mi.BSDFContext | None = None) -> list[Array]:
+    def both(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> list[Array]:
         """``eval`` and ``pdf``, each by itself."""
 
-        def values(*at: Any) -> list[mi.Spectrum]:
-            return [self.plugin.eval(*at), self.plugin.pdf(*at)]
+        def values(*asked: Any) -> list[mi.Spectrum]:
+            return [self.plugin.eval(*asked), self.plugin.pdf(*asked)]
 
-        return self.ask(values, wi, wo, uv, ctx)
+        return self.ask(values, at, ctx)
 
-    def pair(self, wi: Array, wo: Array, uv: Array, ctx: mi.BSDFContext | None = None) -> list[Array]:
+    def pair(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> list[Array]:
         """The two of ``eval_pdf``."""
-        return self.ask(self.plugin.eval_pdf, wi, wo, uv, ctx)
+        return self.ask(self.plugin.eval_pdf, at, ctx)
 
-    def sample(self, wi: Array, u: Array, uv: Array, ctx: mi.BSDFContext | None = None) -> Lanes:
-        """Samples: ``wo`` [N, 3], ``weight`` [N, channels], the others [N].
+    def sample(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> Lanes:
+        """Samples by ``u``, together with where: ``wo`` [N, 3], ``weight`` [N, channels], the others [N].
 
         ``delta``: whether it is from a lobe of one direction only; ``lit``: whether its weight is not 0.
+        Directions that are not finite are 0.
         """
 
         def call(c: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Vector3f) -> Sequence[Any]:
             bs, weight = self.plugin.sample(c, si, u.x, mi.Point2f(u.y, u.z))
             return [bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, weight]
 
-        s = named("wo pdf eta type component weight", self.ask(call, wi, u, uv, ctx))
-        s.type = s.type.astype(np.int64)
-        s.component = s.component.astype(np.int64)
-        s.delta = (s.type & int(mi.BSDFFlags.Delta)) != 0
-        s.lit = (s.weight != 0).any(axis=1)
-        return s
+        wo, pdf, eta, flags, lobe, weight = self.ask(call, at, ctx, "u")
+        flags = flags.astype(np.int64)
+        return at.having(
+            wo=np.where(np.isfinite(wo).all(axis=1, keepdims=True), wo, 0),
+            pdf=pdf,
+            eta=eta,
+            flags=flags,
+            lobe=lobe.astype(np.int64),
+            weight=weight,
+            delta=(flags & mi.BSDFFlags.Delta) != 0,
+            lit=(weight != 0).any(axis=1),
+        )
 
 
 def not_finite(*values: mi.Float | mi.Spectrum, least: float = -np.inf) -> mi.Mask:

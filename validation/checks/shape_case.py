@@ -11,7 +11,7 @@ from numpy.linalg import norm
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.checks import subject
-from mrt_mitsuba.validation.checks.law import Skip
+from mrt_mitsuba.validation.checks.law import FEWEST, Skip
 from mrt_mitsuba.validation.checks.noise import ROUNDING
 from mrt_mitsuba.validation.checks.probe import (
     Array,
@@ -39,23 +39,24 @@ print("from just behind:", back.n, "at", back.t)
 
 
 def trace(target: mi.Scene, o: Array, d: Array) -> Lanes:
-    """Trace rays from float32 points [N, 3] in directions [N, 3].
+    """Trace rays from points [N, 3] in directions [N, 3], both rounded to float32.
 
     The hits have the rays themselves (``o``, ``d``), whether a ray met anything (``met``), the distance
     ``t``, the points and vectors ``p``, ``n``, ``shading``, ``du``, ``dv`` [N, 3], ``uv`` [N, 2], the index
-    of the triangle or the like (``part``), the cosine with the normal (``cos``), and whether the surface is
-    ``steep``: met, and not in passing.
+    of the triangle or the like (``part``), the cosine with the normal (``cos``), whether the surface is
+    ``steep``: met, and not in passing; and whether a ray is ``clear``: it does not graze.
     """
 
     def call(origin: mi.Point3f, direction: mi.Vector3f) -> list[mi.Float]:
         si = target.ray_intersect(mi.Ray3f(origin, direction))
         return [si.is_valid(), si.t, si.p, si.n, si.sh_frame.n, si.dp_du, si.dp_dv, si.uv, si.prim_index]
 
-    hits = named("met t p n shading du dv uv part", lanes(call, ("Point3f", o), ("Vector3f", d)))
-    hits.o = o
-    hits.d = d
-    hits.cos = dot(hits.n, d)
+    ray = Lanes(o=np.float32(o), d=np.float32(d))
+    found = lanes(call, ("Point3f", ray.o), ("Vector3f", ray.d))
+    hits = named("met t p n shading du dv uv part", found).having(**vars(ray))
+    hits.cos = dot(hits.n, hits.d)
     hits.steep = hits.met & (abs(hits.cos) > FLAT)
+    hits.clear = hits.steep | ~hits.met
     return hits
 
 
@@ -69,7 +70,7 @@ def walk(target: mi.Scene, hits: Lanes) -> Iterator[tuple[Array, Lanes]]:
     line = np.arange(len(hits.t))
     for _ in range(MOST_HITS):
         line = line[hits.met]
-        hits = hits.only(hits.met)
+        hits = hits[hits.met]
         if not len(line):
             return
         yield line, hits
@@ -127,9 +128,9 @@ class Case(Subject):
     def met(self) -> Lanes:
         """The rays that meet the surface and do not graze it, and their hits."""
         steep = self.seen.steep
-        if steep.sum() < 20:
+        if steep.sum() < FEWEST:
             raise Skip("hardly any ray towards its bounding box meets the shape")
-        return self.seen.only(steep)
+        return self.seen[steep]
 
     @cached_property
     def behind(self) -> Lanes:
@@ -161,7 +162,7 @@ class Case(Subject):
     def closed(self) -> bool:
         """Whether most lines cross the surface an even number of times: it is closed, with holes perhaps."""
         judged, even = self.lines
-        return bool(judged.sum() > 20 and even[judged].mean() > 0.75)
+        return bool(judged.sum() > FEWEST and even[judged].mean() > 0.75)
 
     @cached_property
     def lines(self) -> tuple[Array, Array]:
@@ -200,4 +201,4 @@ def near(p: Array, q: Array) -> Array:
 def leave(hits: Lanes, d: Array) -> Array:
     """Origins [N, 3] off points ``p`` with normals ``n``, on the side of ``d``, as ``spawn_ray`` has them."""
     outwards = np.sign(dot(hits.n, d))[:, None] * hits.n
-    return np.float32(hits.p + outwards * offset(hits.p)[:, None])
+    return hits.p + outwards * offset(hits.p)[:, None]

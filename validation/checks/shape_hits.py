@@ -15,11 +15,11 @@ from scipy import stats
 from mrt_mitsuba.validation.checks import noise, subject
 from mrt_mitsuba.validation.checks.faults import SIZE, larger, member, off_surface, put, tilted
 from mrt_mitsuba.validation.checks.law import (
+    FEWEST,
     LEVEL,
     Figure,
     Law,
     Skip,
-    at_most,
     figures,
     finds,
     most,
@@ -94,8 +94,8 @@ def _answers(law: Law, case: Case, rays: str, seen: Lanes, reach: float) -> None
     answers = lanes(call, ("Point3f", seen.o), ("Vector3f", seen.d), ("Float", maxt))
     limit = 5e-4 if np.isinf(reach) else 0
     for name, answer in zip(("ray_test", "ray_intersect"), answers, strict=True):
-        wrong = (~seen.met | seen.steep) & (answer != (seen.met & (reach > 1)))
-        law.hold(name, wrong, seen, limit=limit, maxt=maxt, rays=rays)
+        wrong = answer != (seen.met & (reach > 1))
+        law.hold(name, wrong, seen, where=seen.clear, limit=limit, maxt=maxt, rays=rays)
 
 
 def too_far(size, si, ray):
@@ -171,7 +171,7 @@ def surface(law: Law, case: Case) -> None:
     _from_near_by(law, case)
     _again(law, case)
     step = 1e-3 * case.size
-    again = trace(case.target, np.float32(met.p - step * met.d), met.d)
+    again = trace(case.target, met.p - step * met.d, met.d)
     missed = ~again.met | (norm(again.p - met.p, axis=1) >= step)
     law.hold("missed", missed, again)
     _noise(law, case)
@@ -180,13 +180,13 @@ def surface(law: Law, case: Case) -> None:
 def _again(law: Law, case: Case) -> None:
     """Rays that leave the surface do not meet it where they start."""
     count = case.count(10**5, 10**6)
-    few = case.met.only(case.rng.integers(len(case.met.t), size=count))
+    few = case.met[case.rng.integers(len(case.met.t), size=count)]
     away = case.units(count)
     again = trace(case.target, leave(few, away), away)
     # another part may truly be that near, in a hollow edge
     alike = abs(dot(again.n, few.n)) > np.where(again.part == few.part, 0.9, 0.9999)
-    bad = again.met & near(few.p, again.p) & alike & (abs(dot(few.n, away)) > FLAT)
-    law.hold("again", bad, again, count=count)
+    bad = again.met & near(few.p, again.p) & (abs(dot(few.n, away)) > FLAT)
+    law.hold("again", bad, again, where=alike, count=count)
 
 
 def _noise(law: Law, case: Case) -> None:
@@ -211,19 +211,18 @@ def _from_near_by(law: Law, case: Case) -> None:
     met = case.few(case.met, 2**12, 2**15)
     d = met.d
     reach = 0.05 * case.size
-    again = trace(case.target, np.float32(met.p - reach * d), d)
+    again = trace(case.target, met.p - reach * d, d)
     same = again.met & near(met.p, again.p)
     largest = abs(met.p).max(axis=1) + reach
     along = again.o + np.float64(again.t[:, None]) * d
     off = abs(along - again.p).max(axis=1)
     # the same line the other way around, from as far behind
-    back = trace(case.target, np.float32(met.p + reach * d), -d)
+    back = trace(case.target, met.p + reach * d, -d)
     apart = norm(np.float64(back.p) - again.p, axis=1) * abs(dot(met.n, d))
     alike = same & back.met & (back.part == met.part) & (apart < 0.01 * case.size)
     alike &= case.behind.met.mean() > 0.5  # else rays pass it from behind
-    for name, error, known in (("near_by", off, same), ("behind", apart, alike)):
-        if known.sum() > 20:
-            law.hold(name, np.where(known, error / (ROUNDING * largest), np.nan), again)
+    law.hold("near_by", off / (ROUNDING * largest), again, where=same)
+    law.hold("behind", apart / (ROUNDING * largest), again, where=alike)
 
 
 NEIGHBOUR = """aside = mi.Vector3f({aside})
@@ -304,12 +303,12 @@ def normals(law: Law, case: Case) -> None:
     # the normal is the surface's, not the ray's: the same for a ray that comes back from behind
     back = case.behind
     same = back.met & near(met.p, back.p) & (back.part == met.part)
-    if same.sum() > 20:
-        law.hold("turned", same & (dot(back.n, met.n) < -0.5), met)
+    if same.sum() > FEWEST:
+        law.hold("turned", dot(back.n, met.n) < -0.5, met, where=same)
     along = unit(np.stack([met.du, met.dv]))  # NaN where the derivative is 0
     slant = abs(dot(along, met.n)).max(axis=0)
     if np.isfinite(slant).any():
-        law.hold("slant", np.where(np.isfinite(slant), slant, 0), met)
+        law.hold("slant", slant, met, where=np.isfinite(slant))
     _differences(law, case)
 
 
@@ -320,7 +319,7 @@ def _differences(law: Law, case: Case) -> None:
     slopes = []
     partials = []
     for h in (2e-3, 1e-3):
-        other = trace(case.target, np.float32(met.o + h * case.size * aside), met.d)
+        other = trace(case.target, met.o + h * case.size * aside, met.d)
         step = (other.p - met.p).astype(np.float64)
         length = norm(step, axis=1)
         ok = other.met & (other.part == met.part) & (dot(other.n, met.n) > 0.9)
@@ -331,8 +330,7 @@ def _differences(law: Law, case: Case) -> None:
         ok &= (np.abs([du, dv]).max(axis=(0, 2)) < 0.2) & met.du.any()
         partials.append(np.where(ok, off, np.nan))
     for name, (wide, narrow) in (("slope", slopes), ("step", partials)):
-        if np.isfinite(wide + narrow).sum() >= 20:
-            law.hold(name, np.maximum(2 * narrow - wide, 0), met, aside=aside, size=case.size)
+        law.hold(name, np.maximum(2 * narrow - wide, 0), met, aside=aside, size=case.size)
 
 
 def slit(size, si, ray):
@@ -353,7 +351,7 @@ def slit_above(size, si, ray):
         "near sharp edges, the offset of a ray that goes on leads out again; grazing lines are left out",
         RAY,
     ),
-    out=at_most(
+    out=most(
         "share of rays from inside, of {count}, that surely meet nothing",
         1e-5,
         "a closed surface; of a million rays at triangles, some pass along an edge",
@@ -374,7 +372,7 @@ def watertight(law: Law, case: Case) -> None:
     if not case.closed:
         raise Skip("the shape is open: lines do not leave it as often as they enter")
     judged, even = case.lines
-    law.hold("odd", judged & ~even, case.seen, judged=judged.sum())
+    law.hold("odd", ~even, case.seen, where=judged, judged=judged.sum())
     inside = _inside(case)
     if not len(inside):
         law.notes.append("no room inside to start rays in")
@@ -384,7 +382,7 @@ def watertight(law: Law, case: Case) -> None:
     hits = trace(case.target, o, case.units(count))
     out = stats.binomtest(count - hits.met.sum(), count)
     surely = out.proportion_ci(1 - 2 * LEVEL).low  # Clopper and Pearson
-    law.hold("out", surely, hits.only(hits.met.argmin()), count=count)
+    law.hold("out", surely, hits[hits.met.argmin()], count=count)
 
 
 def _inside(case: Case) -> Array:
@@ -434,13 +432,11 @@ def scale(law: Law, case: Case) -> None:
         grown = norm(high - low)
         if not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
             raise Skip("to_world does not scale all of it (of curves, the radius stays)")
-        there = trace(case.scene(to_world=to_world), np.float32(seen.o * 2.0**power), seen.d)
+        there = trace(case.scene(to_world=to_world), seen.o * 2.0**power, seen.d)
+        error = np.maximum(abs(there.t / 2.0**power / seen.t - 1), 1 - dot(there.n, seen.n))
         both = seen.steep & there.met
-        apart = abs(there.t / 2.0**power - seen.t) / np.where(both, seen.t, 1)
-        error = np.where(both, np.maximum(apart, 1 - dot(there.n, seen.n)), 0)
-        otherwise = (~seen.met | seen.steep) & (there.met != seen.met)
-        for name, errors in (("answer", otherwise), ("off", error)):
-            law.hold(name, errors, seen, power=power, matrix=larger.tolist())
+        for name, errors, judged in (("answer", there.met != seen.met, seen.clear), ("off", error, both)):
+            law.hold(name, errors, seen, where=judged, power=power, matrix=larger.tolist())
 
 
 TWICE = """for o in (o, mi.Point3f({other})):
@@ -475,9 +471,8 @@ def far(law: Law, case: Case) -> None:
     goal = np.float64(met.p)
     d = met.d
     exactly = np.float64(d)
-    there = trace(case.target, np.float32(goal - distance * exactly), d)
-    closer = np.float32(there.o + (FAR - 1.5) * case.size * exactly)
-    here = trace(case.target, closer, d)
+    there = trace(case.target, goal - distance * exactly, d)
+    here = trace(case.target, there.o + (FAR - 1.5) * case.size * exactly, d)
     cos = abs(here.cos)
     apart = norm(np.float64(there.p) - here.p, axis=1)
     error = apart * cos / (ROUNDING * distance)
@@ -486,9 +481,9 @@ def far(law: Law, case: Case) -> None:
     bad &= norm(here.p - goal, axis=1) < 20 * ROUNDING * distance
     across = unit(np.cross(d, case.units(len(d))))
     for side in (across, -across, np.cross(d, across), np.cross(across, d)):
-        aside = trace(case.target, np.float32(closer + 4 * ROUNDING * distance * side), d)
+        aside = trace(case.target, here.o + 4 * ROUNDING * distance * side, d)
         bad &= aside.met & (dot(aside.n, here.n) > 0.9)
-    law.hold("missed", bad, there, other=closer)
+    law.hold("missed", bad, there, other=here.o)
 
 
 def no_number_along_axis(size, si, ray):
@@ -503,7 +498,7 @@ def no_number_in_place(size, si, ray):
 
 @figures(
     bad=number_of("hits with numbers that are not finite", 0, "one NaN spoils a picture", RAY),
-    million=at_most(
+    million=most(
         "hits of {count} rays at random, or sampled positions, with numbers that are not finite",
         0,
         "one NaN spoils a picture",
@@ -565,7 +560,7 @@ def higher_bottom(size, box):
 
 
 @figures(
-    outside=at_most("points outside the bounding box, in sizes", 1e-5, "some roundings", RAY),
+    outside=most("points outside the bounding box, in sizes", 1e-5, "some roundings", RAY),
 )
 @finds("outside", "a box too small above, in sizes", 3e-5, bbox=lower_top)
 @finds("outside", "a box too small below, in sizes", 3e-5, bbox=higher_bottom)
@@ -578,7 +573,7 @@ def bbox(law: Law, case: Case) -> None:
     p = np.concatenate(points)
     out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
     worst = min(out.argmax(), len(met.t) - 1)
-    law.hold("outside", out.max(), met.only(worst))
+    law.hold("outside", out.max(), met[worst])
 
 
 @figures(
@@ -596,6 +591,6 @@ def variants(law: Law, case: Case) -> None:
     other = case.other_kind
     seen = case.few(case.seen, 500, 2000)
     there = case.elsewhere(other, lambda: trace(case.scene(), seen.o, seen.d))
-    law.hold("answer", (there.met != seen.met) & (seen.steep | ~seen.met), seen, other=other)
+    law.hold("answer", there.met != seen.met, seen, where=seen.clear, other=other)
     error = abs(there.t - seen.t) / (ROUNDING * (abs(seen.o).max(axis=1) + seen.t))
-    law.hold("distance", np.where(there.met & seen.steep, error, 0), seen, other=other)
+    law.hold("distance", error, seen, where=there.met & seen.steep, other=other)

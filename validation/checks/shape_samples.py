@@ -14,7 +14,6 @@ from mrt_mitsuba.validation.checks.law import (
     SIGMAS,
     Figure,
     Law,
-    at_most,
     figures,
     finds,
     most,
@@ -83,7 +82,7 @@ def too_short(size, ds, it, u):
 
 @figures(
     position=most("density of a position against pdf_position(), relative", 1e-3, SAME, POSITIONS),
-    area=at_most("mean of 1 / density against surface_area(), relative", 1e-3, SAME, POSITIONS),
+    area=most("mean of 1 / density against surface_area(), relative", 1e-3, SAME, POSITIONS),
     off=Figure(
         0.9,
         "sampled positions off the surface, 9 in 10, in roundings of the largest coordinate",
@@ -98,7 +97,7 @@ def too_short(size, ds, it, u):
         "one surface",
         RAY,
     ),
-    crossings=at_most(
+    crossings=most(
         f"surface_area() against that by crossings of lines, relative, beyond {SIGMAS} standard errors",
         3e-3,
         "lines that graze may cross twice within the offset of a spawned ray",
@@ -121,7 +120,7 @@ def too_short(size, ds, it, u):
     aim=rare(
         "chance of such directions, if they follow their density, from the worst of some places", POSITIONS
     ),
-    angle=at_most(
+    angle=most(
         "solid angle of what is visible, or its middle or width, by samples against uniform "
         f"directions, beyond {SIGMAS} standard errors",
         1e-2,
@@ -187,14 +186,13 @@ def sampling(law: Law, case: Case) -> None:
     law.hold("area", abs(np.mean(1 / s.pdf) / area - 1))
     # sampled positions, and their normals, as rays meet them
     few = case.few(s, 2**14, 2**17)
-    back = trace(case.target, np.float32(few.p + few.n * 0.01 * case.size), unit(-few.n))
+    back = trace(case.target, few.p + few.n * 0.01 * case.size, unit(-few.n))
     # another part of the surface may be nearer than a hundredth of the size
     away = np.where(back.met, norm(back.p - few.p, axis=1), np.inf)
     scale = abs(few.p).max(axis=1) + 0.01 * case.size
     law.hold("off", away / (ROUNDING * scale), back)
-    if back.met.any():
-        cosine = np.minimum(dot(few.n, back.shading), dot(few.n, back.n)) / norm(few.n, axis=1)
-        law.hold("normal", np.where(back.met, 1 - cosine, np.nan), back)
+    cosine = np.minimum(dot(few.n, back.shading), dot(few.n, back.n)) / norm(few.n, axis=1)
+    law.hold("normal", 1 - cosine, back, where=back.met)
     if case.behind.met.mean() > 0.5:
         _area(law, case, s, area)
     else:
@@ -209,7 +207,7 @@ def _area(law: Law, case: Case, s: Lanes, area: float) -> None:
     d = case.units(count)
     across = unit(np.cross(d, case.units(count)))
     disk = radius * np.sqrt(case.rng.random((count, 1))) * across
-    start = np.float32(case.middle + disk - 2 * radius * d)
+    start = case.middle + disk - 2 * radius * d
     # where two parts of the surface coincide, a line meets only one of them
     at = Lanes(p=s.p, n=unit(s.n))
     one = trace(case.target, leave(at, at.n), -at.n)
@@ -291,10 +289,10 @@ def _directions(law: Law, case: Case) -> None:
         law.notes.append("the shape has no sample_direction()")
         return
     drawn = pdf > 0
-    met = trace(case.target, o, np.float32(d))
-    law.hold("direction", np.where(drawn, abs(pdf / again - 1), 0), met)
+    met = trace(case.target, o, d)
+    law.hold("direction", abs(pdf / again - 1), met, where=drawn)
     before_it = met.steep & (met.t > dist * (1 + 1e-3))
-    law.hold("misses", drawn & np.where(met.met, before_it, True), met)
+    law.hold("misses", before_it | ~met.met, met, where=drawn)
     mean, variance = _moments(case, met, _visible(dist, pdf, met))
     # the same by uniform directions into the cone that holds the shape
     o = case.around(case.count(2**17, 2**19))
@@ -345,7 +343,7 @@ def _aim(case: Case, count: int) -> float:
         place = np.float32(case.middle + 1.5 * case.size * unit(rng.normal(size=3)))
         o = np.tile(place, (count, 1))
         d, dist, pdf, _ = _sampled(case, o, rng.random((count, 2), np.float32))
-        weight = _visible(dist, pdf, trace(case.target, o, np.float32(d)))
+        weight = _visible(dist, pdf, trace(case.target, o, d))
         away = _into_cone(case, o, rng)
         seen = away[trace(case.target, o, away).met]
         fewest = count // 16

@@ -8,12 +8,12 @@ Morton code at which it starts.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import stats
 
-from mrt_mitsuba.validation.checks.law import Law
+from mrt_mitsuba.validation.checks.law import NOWHERE, Law
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, finite_or_0, joined
 from mrt_mitsuba.validation.tools.compare import sidak
 
@@ -53,8 +53,8 @@ class Cells(Lanes):
         while len(cells.start):
             first, last = np.searchsorted(codes, [cells.start, cells.end])
             full = (last - first > most) & (cells.level < DEPTH)
-            done.append(cells.only(~full))
-            cells = cells.only(full).quartered()
+            done.append(cells[~full])
+            cells = cells[full].quartered()
         return in_order(done)
 
     @property
@@ -124,9 +124,9 @@ class Cells(Lanes):
         phi = 2 * np.pi * (turn - 0.5)
         return r, r + width, phi, phi + 2 * np.pi * width, -1 if self.below[index] else 1
 
-    def counts(self, wo: Array) -> Array:
-        """How many of the directions [N, 3] lie in each cell. [C]"""
-        return np.bincount(self.find(encode(wo)), minlength=len(self.start))
+    def counts(self, codes: Array, weights: Array | None = None) -> Array:
+        """How many of the directions lie in each cell, or the sum of their weights. [C]"""
+        return np.bincount(self.find(codes), weights, minlength=len(self.start))
 
     def integrals(self, function: Callable[[Array], Array], rng: np.random.Generator) -> tuple[Array, Array]:
         """Integrals of ``function(directions [N, 3]) -> [N, K]`` over cells, and their variances. [C, K]"""
@@ -148,7 +148,7 @@ def small_cells() -> Cells:
 
 
 def hold_small(
-    law: Law, cells: Cells, seen: Array, expected: Array, variance: Array, known: float, **names: Any
+    law: Law, cells: Cells, seen: Array, expected: Array, variance: Array, known: float, at: Lanes = NOWHERE
 ) -> None:
     """Hold ``small`` to the least chance of what is ``seen`` in cells, and ``slices`` to that in their rows.
 
@@ -158,13 +158,13 @@ def hold_small(
     seen, expected, variance = np.where(np.isfinite(expected), [seen, expected, variance], 0)
     chances = chances_of(seen, expected, variance, known)
     cell = cells.bounds(int(chances.argmin()))
-    law.hold("small", sidak(chances.min(), 2 * len(chances)), cell=cell, **names)
+    law.hold("small", sidak(chances.min(), 2 * len(chances)), at, cell=cell)
     rows = []
     for row in cells.rows():
         many, wanted, doubt = (np.bincount(row, x) for x in (seen, expected, variance))
         rows.append(chances_of(many, wanted, doubt, known))
     chances = np.concatenate(rows)
-    law.hold("slices", sidak(chances.min(), 2 * len(chances)), **names)
+    law.hold("slices", sidak(chances.min(), 2 * len(chances)), at)
 
 
 def chances_of(seen: Array, expected: Array, variance: Array, known: float) -> Array:
@@ -178,7 +178,7 @@ def chances_of(seen: Array, expected: Array, variance: Array, known: float) -> A
 def in_order(parts: Sequence[Cells]) -> Cells:
     """The cells of several sets, in the order of their codes."""
     cells = joined(parts)
-    return cells.only(np.argsort(cells.start))
+    return cells[np.argsort(cells.start)]
 
 
 def integrate(
@@ -186,8 +186,8 @@ def integrate(
     cells: Cells,
     rng: np.random.Generator,
     codes: Array,
-    weights: Array,
     samples: int,
+    weights: ArrayLike = 1.0,
 ) -> Cells:
     """Integrate ``function(directions [N, 3]) -> [N, K]`` over cells; those known too badly are cut further.
 
@@ -202,7 +202,8 @@ def integrate(
     done = []
     order = np.argsort(codes)
     codes = codes[order]
-    below = np.concatenate([[0], np.cumsum(weights[order])]) / samples
+    sums = np.cumsum(np.broadcast_to(weights, codes.shape)[order])
+    below = np.concatenate([[0], sums]) / samples
     for attempt in range(ATTEMPTS):
         first, last = below[np.searchsorted(codes, [cells.start, cells.end])]
         by_samples = last - first
@@ -213,11 +214,10 @@ def integrate(
         bad = (variance / total**2 > enough).any(axis=1)
         bad |= (by_samples * samples > 1.5) & (mean[:, 0] < 0.2 * by_samples)
         bad &= (cells.level < DEPTH) & (attempt < ATTEMPTS - 1)
-        integrals = Cells(**{**vars(cells), "mean": mean, "variance": variance})
-        done.append(integrals.only(~bad))
+        done.append(cells.having(mean=mean, variance=variance)[~bad])
         if not bad.any():
             break
-        cells = cells.only(bad).quartered()
+        cells = cells[bad].quartered()
     return in_order(done)
 
 
@@ -231,7 +231,7 @@ def chi_square(
     and z of a 16th. The second is the cell that is most off. ``known``: to how much the density is known,
     relative.
     """
-    seen = np.bincount(integrals.find(codes), minlength=len(integrals.start))
+    seen = integrals.counts(codes)
     expected = count * integrals.mean[:, 0]
     variance = count**2 * integrals.variance[:, 0]
     neighbours = np.arange(len(seen))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.validation.checks.probe import Array, Probe, direction, unit
+from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, direction, unit
 
 RESOLUTION = 700  # of the quadrature of an albedo, on each axis
 
@@ -50,7 +50,7 @@ def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array
 
 def evaluate(bsdf: Any, wi: Array, wo: Array) -> list[Array]:
     """Values f cos θo [N, channels] and density [N] of pairs of directions [N, 3]."""
-    return Probe(bsdf).pair(wi, wo, np.zeros(2))
+    return Probe(bsdf).pair(Lanes(wi=wi, wo=wo, uv=np.zeros(2)))
 
 
 def albedo(bsdf: Any, wi: Array) -> Array:
