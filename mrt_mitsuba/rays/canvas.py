@@ -103,7 +103,7 @@ class Canvas:
     def _put_one_by_one(self, place: np.ndarray, values: np.ndarray, pixels: np.ndarray) -> None:
         """Add values [channels, rays] at places [2, rays], of rays that start in these pixels."""
         film = self._film
-        evaluate = film.sensor.film().rfilter().eval
+        evaluate = film.rfilter.eval
         if len(self._moments):
             colors = values[:3]
             for plane, value in zip(self._moments, [*colors, *colors**2], strict=False):
@@ -154,7 +154,7 @@ class _Rays:
     def filtered(self, low: int, high: int, channels: range, down: range, across: range) -> list[mi.Float]:
         """Return what the rays in each pixel give to the pixels at some offsets: by row and column of these,
         and by channel."""
-        rfilter = self.film.sensor.film().rfilter()
+        evaluate = self.film.rfilter.eval
         pixel = dr.arange(mi.UInt32, high - low) + opaque(low)
         line, column = divide(pixel, self.film.width)
         row = divide(line, self.film.height)[1]
@@ -165,8 +165,8 @@ class _Rays:
             weights = [mi.Float(1)]
             if self.film.reach:
                 place = dr.gather(mi.Point2f, self.place, ray)
-                along = [rfilter.eval(centre - place.x) for centre in x]
-                weights = [rfilter.eval(centre - place.y) * weight for centre in y for weight in along]
+                along = [evaluate(centre - place.x) for centre in x]
+                weights = [evaluate(centre - place.y) * weight for centre in y for weight in along]
             values = [
                 dr.gather(mi.Float, value, ray) for value in self.values[channels.start : channels.stop]
             ]

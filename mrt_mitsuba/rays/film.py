@@ -16,32 +16,32 @@ from numpy.lib.stride_tricks import sliding_window_view
 STEPS = 32  # of a pixel, where integrals over a filter are summed
 
 
-def opaque(number: float) -> mi.Float:
-    """Return a number as data of a kernel, so that another needs no other kernel."""
+def opaque(number: float, kind: str | None = None) -> mi.Float:
+    """A number as data of a kernel, so that another number needs no other kernel.
+
+    ``kind``: name of its type in Mitsuba; None: UInt32 for a whole number, else Float.
+    """
     variant = mi.variant()
     if variant.startswith("scalar"):
         return number
-    return _data(variant, "UInt32" if isinstance(number, int) else "Float", number)
+    if kind is None:
+        kind = "UInt32" if isinstance(number, int) else "Float"
+    # a kernel that dr.freeze records may read only what is made while it does
+    make = _array.__wrapped__ if dr.flag(dr.JitFlag.FreezingScope) else _array
+    return make(variant, kind, number)
 
 
 def divide(n: mi.UInt32, divisor: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Return quotient and remainder of whole numbers below 2³².
+    """Quotient and remainder of whole numbers below 2³².
 
     A processor divides the integers of a packet one after the other, which takes as long as tracing the ray;
     so vectorised variants multiply by the inverse in double precision. The half added keeps n/d away from
     whole numbers by 1/(2 d), and rounding moves it by less than n/d / 2⁵² < 1/(2 d).
     """
-    variant = mi.variant()
-    if variant.startswith("scalar"):
+    if mi.variant().startswith("scalar"):
         return divmod(n, divisor)
-    quotient = mi.UInt32((mi.Float64(n) + 0.5) * _data(variant, "Float64", 1 / divisor))
-    return quotient, n - quotient * _data(variant, "UInt32", divisor)
-
-
-def _data(variant: str, kind: str, number: float) -> mi.Float:
-    # a kernel that dr.freeze records may read only what is made while it does
-    make = _array.__wrapped__ if dr.flag(dr.JitFlag.FreezingScope) else _array
-    return make(variant, kind, number)
+    quotient = mi.UInt32((mi.Float64(n) + 0.5) * opaque(1 / divisor, "Float64"))
+    return quotient, n - quotient * opaque(divisor)
 
 
 @lru_cache(maxsize=64)
@@ -58,7 +58,7 @@ class Region(NamedTuple):
     height: int
 
     def grown(self, reach: int, width: int, height: int) -> Region:
-        """Return the region with so many pixels around it, as far as the picture goes."""
+        """The region with so many pixels around it, as far as the picture goes."""
         left = max(self.x - reach, 0)
         top = max(self.y - reach, 0)
         right = min(self.x + self.width + reach, width)
@@ -66,7 +66,7 @@ class Region(NamedTuple):
         return Region(left, top, right - left, bottom - top)
 
     def inside(self, other: Region) -> tuple[slice, slice]:
-        """Return its rows and columns in an array of another region's pixels."""
+        """Its rows and columns in an array of another region's pixels."""
         top = self.y - other.y
         left = self.x - other.x
         return slice(top, top + self.height), slice(left, left + self.width)
@@ -107,8 +107,8 @@ class Places:
         return self.lattice == "report" or (self.lattice == "centered" and self.aa % 2 == 1)
 
     def at(self, pixel: mi.UInt32, ray: mi.UInt32, width: int, height: int) -> tuple[mi.Point2f, mi.Float]:
-        """Return the start of a ray of a pixel: its place in a picture of this size, [0, 1]², x to the right
-        and y down, and its time."""
+        """Where and when rays of pixels start: the place in a picture of this size, [0, 1]², x to the right
+        and y down, and the time."""
         row, column = divide(pixel, width)
         sample = divide(ray, self.repeats)[0] + opaque(self.first)
         if self.lattice == "centered" and self.holds_centre:
@@ -150,6 +150,7 @@ class Film:
         sampler = sensor.sampler()
         rfilter = film.rfilter()
         self.sensor = sensor
+        self.rfilter = rfilter
         #: pixels on either side to which a ray contributes
         self.reach = 0 if rfilter.is_box_filter() else int(rfilter.border_size())
         #: pixels that are sampled around the picture, and are no part of it
@@ -168,21 +169,20 @@ class Film:
             self.bands = tuple(field.name for field in film.bitmap().struct_())
         self.rays = int(sampler.sample_count())  #: of a pixel, as the scene's sampler has them
         self.sampler = sampler.class_name()
-        self.rfilter = rfilter.class_name()
 
     def picture(self, sampled: np.ndarray) -> np.ndarray:
-        """Return the picture in an array [..., rows, columns, channels], without the border."""
+        """The picture in an array [..., rows, columns, channels], without the border."""
         rows, columns = (slice(self.border, n - self.border) for n in self.shape)
         return sampled[..., rows, columns, :]
 
     def rays_near(self, count: int) -> int:
-        """Return the number of rays a pixel that the scene's sampler makes of a number."""
+        """The rays of a pixel, by the nearest number that the scene's sampler allows."""
         sampler = self.sensor.sampler().clone()
         sampler.set_sample_count(count)
         return int(sampler.sample_count())
 
     def place(self, pixel: mi.UInt32, sampler: mi.Sampler) -> tuple[mi.Point2f, mi.Point2f]:
-        """Return places in pixels that a sampler draws: on the film, and in the picture, [0, 1]²."""
+        """Places in pixels that a sampler draws: on the film, in pixels, and in the picture, [0, 1]²."""
         border = float(self.border)
         size = mi.Vector2f(opaque(self.width - 2 * border), opaque(self.height - 2 * border))
         row, column = divide(pixel, self.width)
@@ -195,11 +195,10 @@ class Film:
         pixels = np.arange(-self.reach, self.reach + 1)[:, None]
         places = pixels + (np.arange(STEPS) + 0.5) / STEPS - 0.5
         flat = places.ravel().tolist()
-        rfilter = self.sensor.film().rfilter()
         if mi.variant().startswith("scalar"):
-            values = [rfilter.eval(place) for place in flat]
+            values = [self.rfilter.eval(place) for place in flat]
         else:  # a list is copied; for NumPy's memory, Dr.Jit would compile a kernel for every alignment
-            values = rfilter.eval(mi.Float(flat))
+            values = self.rfilter.eval(mi.Float(flat))
         return np.asarray(values, np.float64).reshape(places.shape)
 
     @property
@@ -222,7 +221,7 @@ class Film:
         return float(along) ** 2
 
     def spread_out(self, variance: np.ndarray) -> np.ndarray:
-        """Return the variance [..., H, W] of pixels, up to a factor, given that of the rays in each."""
+        """The variance [..., H, W] of pixels, up to a factor, given that of the mean of the rays in each."""
         share = np.square(self.weights).sum(axis=1)
         share = np.float32(share / share.sum())
         for axis in (-2, -1) if self.reach else ():

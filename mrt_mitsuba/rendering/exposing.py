@@ -1,9 +1,10 @@
 """Exposing pixels: tracing groups of rays in chosen ones, and adding up their values.
 
-Where rays start is up to an object with ``start``: a lattice, the sampler of a scene, or any other sampling
-of a film. What their values add up to is up to a canvas: means over the rays of each pixel, or sums under the
-filter of a film. In vectorised variants rays are traced in wavefronts, split where they would not fit into
-memory; in scalar variants by a loop in Python.
+Where rays start is up to an object with ``start``: given pixels, the numbers of rays among all of their pixel
+and how many groups were in earlier wavefronts, it gives a ``Start``. There is one for a lattice, one for the
+sampler of a scene and one for any other sampling of a film. Values of rays add up to means over the rays of
+each pixel of a lattice, or on a ``Canvas`` to sums under the filter of a film. In vectorised variants rays
+are traced in wavefronts, split where they would not fit into memory; in scalar variants by a loop in Python.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import logging
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -130,15 +131,6 @@ class Start(NamedTuple):
     sampler: mi.Sampler | None  #: of all else that is random; None where nothing is
 
 
-class Starts(Protocol):
-    """Where rays start."""
-
-    def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
-        """Return where rays start, given their pixels and their numbers among all of the pixel; ``before``:
-        groups in earlier wavefronts."""
-        ...
-
-
 def ray_sampler(rays: int) -> mi.Sampler:
     """Independent random numbers, as Mitsuba numbers the rays of a whole picture, ``rays`` in each pixel."""
     return mi.load_dict({"type": "mrt_rays", "rays": rays})
@@ -197,52 +189,10 @@ class SceneStarts:
         return Start(*self._film.place(pixel, sampler), None, sampler)
 
 
+Starts = LatticeStarts | FilmStarts | SceneStarts
+
+
 # ---------------------------------------- What values add up to ----------------------------------------
-
-
-class Means:
-    """Means over the rays of each pixel, or of layers of the first hit what the first ray hit.
-
-    They are written into layers, [pixels, channels] each; or averaged with rows ``chosen`` of them, ``share``
-    being the weights of what is there and of what is new.
-    """
-
-    def __init__(
-        self,
-        layers: Mapping[str, np.ndarray],
-        size: int,
-        chosen: np.ndarray | None = None,
-        share: tuple[int, int] = (0, 1),
-    ) -> None:
-        self._layers = layers
-        self._size = size
-        self._chosen = chosen
-        self._share = share
-
-    def put(self, part: slice, values: Values) -> None:
-        """Take up the values of rays, ``size`` in each pixel of a part."""
-        rows = part if self._chosen is None else self._chosen[part]
-        for name, planes in values.items():
-            first = TABLE[name].source == FIRST_HIT
-            sums = np.broadcast_arrays(*(self._over_rays(plane, first) for plane in planes))
-            means = np.stack(sums, -1).astype(np.float32, copy=False)
-            means *= np.float32(1 if first else 1 / self._size)
-            layer = self._layers[name]
-            if self._chosen is not None:
-                known, new = self._share
-                means = (known * layer[rows] + new * means) / np.float32(known + new)
-            layer[rows] = means
-
-    def _over_rays(self, plane: Any, first: bool) -> np.ndarray:
-        """Return by pixel the sum over its rays, or the value of the first."""
-        size = self._size
-        if first or size == 1:
-            return np.asarray(plane)[::size]
-        if isinstance(plane, np.ndarray):
-            return np.asarray(plane.reshape(-1, size).sum(1))
-        if dr.width(plane) == 1:  # a value of one entry is that of all rays
-            return np.asarray(plane * size)
-        return np.asarray(dr.block_reduce(dr.ReduceOp.Add, plane, size))
 
 
 @dataclass(frozen=True)
@@ -270,7 +220,8 @@ class Stack:
         the ``first`` on."""
         some = slice(first, first + len(chosen))
         each = np.float32(1 / np.maximum(exposed.rays[some], 1))  # variance of a pixel's mean, up to a factor
-        amount = self.rows(chosen) / self.film.spread_out(self.rows(each))
+        shape = self.amount.shape
+        amount = chosen.reshape(shape) / self.film.spread_out(each.reshape(shape))
         return replace(
             self,
             sums=self.sums + amount * exposed.sums[: len(self.sums), some],
@@ -279,21 +230,16 @@ class Stack:
         )
 
     def pictures(self) -> np.ndarray:
-        """Return the pictures one by one, [pictures, H, W, channels], with the film's border."""
+        """The pictures one by one, [pictures, H, W, channels], with the film's border."""
         weights = np.where(self.weights == 0, 1, self.weights)
         return np.moveaxis(self.sums / weights, 0, -1)
 
-    def mean(self, pictures: int | None = None) -> np.ndarray:
-        """Return the mean of the first pictures, each counting alike, [H, W, channels], without the border;
-        None: of all."""
-        amount = np.maximum(self.amount[:pictures], 1e-30)
-        sums = (self.sums[:, :pictures] / amount).sum(1)
-        weights = (self.weights[:pictures] / amount).sum(0)
+    def mean(self) -> np.ndarray:
+        """The mean of the pictures, each counting alike, [H, W, channels], without the border."""
+        amount = np.maximum(self.amount, 1e-30)
+        sums = (self.sums / amount).sum(1)
+        weights = (self.weights / amount).sum(0)
         return self.film.picture(np.moveaxis(sums / np.where(weights == 0, 1, weights), 0, -1))
-
-    def rows(self, values: np.ndarray) -> np.ndarray:
-        """Return a view [pictures, H, W, ...] of values [pictures, pixels, ...]."""
-        return values.reshape(-1, *self.film.shape, *values.shape[2:])
 
 
 def widened(film: Film, counts: np.ndarray) -> np.ndarray:
@@ -302,6 +248,17 @@ def widened(film: Film, counts: np.ndarray) -> np.ndarray:
         return counts
     near = dilated(counts.reshape(-1, *film.shape) > 0, film.reach)
     return np.maximum(counts, near.reshape(counts.shape))
+
+
+def _over_rays(plane: Any, size: int, first: bool) -> np.ndarray:
+    """The sum over the ``size`` rays of each pixel, or the value of the first ray, [pixels]."""
+    if first or size == 1:
+        return np.asarray(plane)[::size]
+    if isinstance(plane, np.ndarray):
+        return np.asarray(plane.reshape(-1, size).sum(1))
+    if dr.width(plane) == 1:  # a value of one entry is that of all rays
+        return np.asarray(plane * size)
+    return np.asarray(dr.block_reduce(dr.ReduceOp.Add, plane, size))
 
 
 class Exposer:
@@ -322,21 +279,42 @@ class Exposer:
         ours = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
         self.names = self.own + ours
 
-    def starts(self, places: Places, seed: Any) -> LatticeStarts | SceneStarts:
-        """Where the rays of a pass start; ``seed``: a number, or an array of one."""
+    def lattice(self, places: Places, seed: Any) -> LatticeStarts:
+        """Where rays start at the samples of a lattice; ``seed``: a number, or an array of one."""
         shader = self.shader
-        if self.film is not None:
-            return SceneStarts(self.film, seed, self.film.rays_near(places.size))
         random = shader.random or mi.is_spectral or shader.sensor.needs_aperture_sample()
         sampler = ray_sampler(places.size) if random else None
         return LatticeStarts(places, shader.width, shader.height, seed, sampler)
 
-    def average(self, groups: Groups, starts: Starts, means: Means, advance: Advance) -> None:
-        """Trace the rays of a lattice in pixels, and take up their means. They do not depend on how memory
-        cuts the rays into wavefronts."""
+    def average(
+        self,
+        groups: Groups,
+        starts: LatticeStarts,
+        layers: Mapping[str, np.ndarray],
+        chosen: np.ndarray | None,
+        advance: Advance,
+    ) -> None:
+        """Trace the rays of a lattice, and write the mean of each pixel into layers, [pixels, channels] each;
+        into layers of the first hit, what its first ray hit.
+
+        ``chosen``: the rows of the pixels in the layers, whose means of earlier samples are averaged with the
+        new ones; None: every row is new. The results do not depend on how memory cuts the rays into
+        wavefronts.
+        """
         channels = len(self.names)
+        known = starts.places.first
+        new = starts.places.count
         for part, _, _, values in self._wavefronts(groups, starts, channels):
-            means.put(part, values)
+            rows = part if chosen is None else chosen[part]
+            for name, planes in values.items():
+                first = TABLE[name].source == FIRST_HIT
+                sums = np.broadcast_arrays(*(_over_rays(plane, groups.size, first) for plane in planes))
+                means = np.stack(sums, -1).astype(np.float32, copy=False)
+                means *= np.float32(1 if first else 1 / groups.size)
+                layer = layers[name]
+                if chosen is not None:
+                    means = (known * layer[rows] + new * means) / np.float32(known + new)
+                layer[rows] = means
             advance(part.stop - part.start)
         workspace = self.job.workspace
         most = max(workspace.rays_at_once(channels), groups.size)
@@ -349,7 +327,7 @@ class Exposer:
         *,
         pictures: int = 1,
         moments: bool = False,
-        advance: Advance = lambda rays: None,
+        advance: Advance,
     ) -> Canvas:
         """Trace groups of rays on a film, and add their values up; with ``moments``, the squares of their
         colours as well."""
@@ -410,7 +388,7 @@ class Exposer:
     def trace(
         self, pixel: mi.UInt32, number: mi.UInt32, starts: Starts, before: int = 0
     ) -> tuple[Any, Values]:
-        """Trace a ray, or one in each lane: return its place on the film, and its values."""
+        """Trace a ray, or one in each lane, for its place on the film, and its values."""
         start = starts.start(pixel, number, before)
         rays = self.shader.values(start.picture, start.time, start.sampler)
         values = {name: _channels(TABLE[name].value(rays)) for name in self.layers}
@@ -419,7 +397,7 @@ class Exposer:
         return start.film, values
 
     def _own(self, rays: RayValues) -> list[mi.Float]:
-        """Return the channels of the film and the integrator."""
+        """The channels of the film and the integrator."""
         film = self.film
         channels = _channels(mi.Color3f(mi.luminance(rays.image)) if film.grey else rays.image)
         if film.alpha:
@@ -432,6 +410,6 @@ class Exposer:
 
 
 def _channels(value: Any) -> list[mi.Float]:
-    """Return the channels of a value."""
+    """The channels of a value."""
     parts = list(value) if dr.size_v(value) > 1 else [value]
     return [mi.Float(part) for part in parts]

@@ -17,7 +17,7 @@ from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.film import Region
-from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Means, Stack, widened
+from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, SceneStarts, Stack, widened
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
 from mrt_mitsuba.rendering.settings import DETECTORS
@@ -76,9 +76,8 @@ class Passes:
 
     def _trace(self, step: Pass, exposer: Exposer) -> None:
         """Trace samples of a lattice: their means are new layers or, at edges, are averaged with these."""
-        places = replace(step.places, seed=self._seed)
-        if self._phase is not None:
-            places = replace(places, phase=self._phase)
+        phase = step.places.phase if self._phase is None else self._phase
+        places = replace(step.places, seed=self._seed, phase=phase)
         pixels = self._pixels
         edge = None
         seed = self._seed
@@ -86,13 +85,10 @@ class Passes:
             edge = np.flatnonzero(self.layers["samples"] > 1).astype(np.uint32)
             pixels = edge + np.uint32(pixels.start) if isinstance(pixels, range) else pixels[edge]
             seed += 1
-        layers = {}
-        for name in exposer.layers:
-            layer = self._layer(name) if edge is None else self.layers[name]
-            layers[name] = layer.reshape(len(self._pixels), -1)
-        means = Means(layers, places.size, edge, (places.first, places.count))
+        layers = {name: self._layer(name).reshape(len(self._pixels), -1) for name in exposer.layers}
+        starts = exposer.lattice(places, seed)
         with self._job.stage(step.name, len(pixels)) as advance:
-            exposer.average(Groups(places.size, pixels), exposer.starts(places, seed), means, advance)
+            exposer.average(Groups(places.size, pixels), starts, layers, edge, advance)
         if "square" in step.layers:
             variance = np.maximum(self.layers.pop("square") - self.layers["image"] ** 2, 0)
             self.layers["variance"] = variance / (places.size - 1)  # of the means
@@ -106,16 +102,13 @@ class Passes:
         marked = np.zeros((plan.height, plan.width), bool)
         if stack is None:
             stack = Stack.blank(film, 1, len(exposer.names))
-            whole = Region(0, 0, plan.width, plan.height)
-            marked[plan.seen.grown(film.reach, plan.width, plan.height).inside(whole)] = True
-            pixels = np.flatnonzero(np.pad(marked, film.border, constant_values=True))
-            chosen = np.ones((1, film.pixels), bool)
+            marked[self._seen] = True
         else:
             marked[self._seen] = self.layers["samples"][..., 0] > 1
-            chosen = np.pad(marked, film.border).reshape(1, -1)
-            pixels = np.flatnonzero(widened(film, chosen)[0])
             seed += 1
-        starts = exposer.starts(step.places, seed)
+        chosen = np.pad(marked, film.border).reshape(1, -1)
+        pixels = np.flatnonzero(widened(film, chosen)[0])
+        starts = SceneStarts(film, seed, rays)
         moments = "square" in step.layers
         with self._job.stage(step.name, len(pixels) * rays) as advance:
             exposed = exposer.expose(Groups(rays, pixels), starts, moments=moments, advance=advance)
@@ -168,8 +161,7 @@ class Passes:
         number = len(exposer.own)
         for name in exposer.layers:
             channels = len(TABLE[name].letters)
-            layer = self.layers[name] if name in self.layers else self._layer(name)
-            layer[:] = picture[..., number : number + channels]
+            self._layer(name)[:] = picture[..., number : number + channels]
             number += channels
 
     # -------------------------------------------- Filters --------------------------------------------
@@ -231,11 +223,12 @@ class Passes:
         self._job.workspace.give_back(min(most, height) * width * BYTES_PER_PIXEL_OF_FILTER)
 
     def _layer(self, name: str) -> np.ndarray:
-        """A new layer of zeros; all but the picture channel by channel, as an EXR wants them."""
-        shape = self._plan.seen.height, self._plan.seen.width
-        channels = len(TABLE[name].letters)
-        planes = np.zeros((*shape, channels) if name == "image" else (channels, *shape), np.float32)
-        self.layers[name] = planes if name == "image" else np.moveaxis(planes, 0, -1)
+        """A layer, of zeros where it is new; all but the picture channel by channel, as an EXR wants them."""
+        if name not in self.layers:
+            shape = self._plan.seen.height, self._plan.seen.width
+            channels = len(TABLE[name].letters)
+            planes = np.zeros((*shape, channels) if name == "image" else (channels, *shape), np.float32)
+            self.layers[name] = planes if name == "image" else np.moveaxis(planes, 0, -1)
         return self.layers[name]
 
 

@@ -289,7 +289,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
         whole=shader.whole,
         width=source.width,
         height=source.height,
-        film=f"{film.rfilter}, {film.pixel_format or 'spectral bands'}" if on_film else "",
+        film=f"{film.rfilter.class_name()}, {film.pixel_format or 'spectral bands'}" if on_film else "",
         bands=film.bands,
         kernel=shader.kernel,
         parts=shader.facts,
@@ -491,7 +491,7 @@ def _ignored(source: Source, film: Film, choices: _Choices) -> Iterator[tuple[st
     if choices.lattice != FILM:
         if source.own:
             yield (
-                f"{film.rfilter} and {film.sampler}",
+                f"{film.rfilter.class_name()} and {film.sampler}",
                 "the lattice that was asked for places and averages samples",
             )
         return

@@ -104,7 +104,7 @@ class Prepared:
         window = _window(sensor.film())
         plain = (
             (sensor.class_name(), film.sampler) == ("PerspectiveCamera", "IndependentSampler")
-            and (film.rfilter, film.pixel_format) == ("BoxFilter", "rgb")
+            and (film.rfilter.class_name(), film.pixel_format) == ("BoxFilter", "rgb")
             and sensor.shutter_open_time() == 0
             and (window[2:4] != size or window[:2] == size)  # else only a part of its film is seen
         )
@@ -147,7 +147,7 @@ class Prepared:
         """The channels along one ray of each pixel."""
         exposer = self._exposer
         plan = self._made.plan
-        starts = exposer.starts(plan.passes[0].places, seed)
+        starts = exposer.lattice(plan.passes[0].places, seed)
         pixel = dr.arange(mi.UInt32, plan.width * plan.height)
         _, values = exposer.trace(pixel, mi.UInt32(0), starts)
         (channels,) = values.values()
