@@ -143,10 +143,13 @@ def compressing(pixels: int) -> Iterator[Any]:
     """
     import OpenEXR
 
+    if pixels < COMPRESSED:
+        yield OpenEXR.NO_COMPRESSION
+        return
     before = OpenEXR.global_thread_count()
     OpenEXR.set_global_thread_count(usable_cores())
     try:
-        yield OpenEXR.ZIP_COMPRESSION if pixels >= COMPRESSED else OpenEXR.NO_COMPRESSION
+        yield OpenEXR.ZIP_COMPRESSION
     finally:
         OpenEXR.set_global_thread_count(before)
 

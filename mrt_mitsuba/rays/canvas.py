@@ -64,33 +64,32 @@ class Canvas:
         np.cumsum(rays, dtype=np.uint32, out=first[1:])
         some = _Rays(place, values, mi.UInt32(first), mi.Float(self._share), film)
         chosen = np.flatnonzero(rays.reshape(-1, film.width).any(1))  # rows
-        step = max(PIXELS_AT_ONCE // film.width, 1)
-        for row in range(chosen[0], chosen[-1] + 1, step):
-            end = min(row + step, chosen[-1] + 1)
-            self._put_rows(some, row * film.width, end * film.width)
+        for rows in _parts(chosen[0], chosen[-1] + 1, max(PIXELS_AT_ONCE // film.width, 1)):
+            self._put_rows(some, rows.start * film.width, rows.stop * film.width)
 
     def _put_rows(self, rays: _Rays, low: int, high: int) -> None:
         """Add what rays give that start in pixels from ``low`` to below ``high``, which are whole rows."""
         film = self._film
-        first, channels = 0, len(self._sums)
+        first = 0
+        channels = len(self._sums)
         if len(self._moments):
             *terms, peak = rays.moments(low, high)
             dr.eval(terms, peak)
-            moments = [np.asarray(term) for term in terms]
-            for known, more in zip(self._moments, moments, strict=False):
-                known[low:high] += more
+            moments = np.stack([np.asarray(term) for term in terms])
+            self._moments[:6, low:high] += moments
             brightest = self._moments[6, low:high]
             np.maximum(brightest, np.asarray(peak), out=brightest)
         if not film.reach:  # whose weights are 1
             channels -= 1
             if len(self._moments):
                 first = 3
-                self._sums[:3, low:high] += self._share[low:high] * np.stack(moments[:3])
+                self._sums[:3, low:high] += self._share[low:high] * moments[:3]
         offsets = _parts(-film.reach, film.reach + 1, OFFSETS_AT_ONCE)
         for some in _parts(first, channels, CHANNELS_AT_ONCE):
             for down, across in product(offsets, offsets):
                 sums = rays.filtered(low, high, some, down, across)
-                begin, end = low, high
+                begin = low
+                end = high
                 if film.reach:
                     begin = max(low + down[0] * film.width, 0)
                     end = min(high + down[-1] * film.width, self.rays.size)
@@ -106,23 +105,20 @@ class Canvas:
         evaluate = film.rfilter.eval
         if len(self._moments):
             colors = values[:3]
-            for plane, value in zip(self._moments, [*colors, *colors**2], strict=False):
-                np.add.at(plane, pixels, value)
+            np.add.at(self._moments[:6].T, pixels, np.concatenate([colors, colors**2]).T)
             np.maximum.at(self._moments[6], pixels, colors.mean(0))
         line, column = np.divmod(pixels, film.width)
         away = (place - np.stack([column, line % film.height]) - 0.5).T.tolist()
         given = np.stack([*values, np.ones(len(pixels))]) * self._share[pixels]
-        for down in range(-film.reach, film.reach + 1):
-            for across in range(-film.reach, film.reach + 1):
-                weight = np.array(
-                    [evaluate(across - x) * evaluate(down - y) if film.reach else 1.0 for x, y in away]
-                )
-                row = line % film.height + down
-                beside = column + across
-                inside = (row >= 0) & (row < film.height) & (beside >= 0) & (beside < film.width)
-                at = (pixels + down * film.width + across)[inside]
-                for plane, value in zip(self._sums, given, strict=True):
-                    np.add.at(plane, at, (value * weight)[inside])
+        for down, across in product(range(-film.reach, film.reach + 1), repeat=2):
+            weight = np.ones(len(pixels))
+            if film.reach:
+                weight[:] = [evaluate(across - x) * evaluate(down - y) for x, y in away]
+            row = line % film.height + down
+            beside = column + across
+            inside = (row >= 0) & (row < film.height) & (beside >= 0) & (beside < film.width)
+            at = (pixels + down * film.width + across)[inside]
+            np.add.at(self._sums.T, at, (given * weight)[:, inside].T)
 
 
 @dataclass(frozen=True)
@@ -136,8 +132,8 @@ class _Rays:
     film: Film
 
     def moments(self, low: int, high: int) -> list[mi.Float]:
-        """Return sums of the colours of the rays in each pixel, sums of their squares, and the largest mean
-        colour of a ray, or 0."""
+        """Sums of the colours of the rays in each pixel, sums of their squares, and the largest mean colour
+        of a ray, or 0."""
 
         def add(ray: mi.UInt32, sums: list[mi.Float], peak: mi.Float) -> tuple:
             colors = [dr.gather(mi.Float, value, ray) for value in self.values[:3]]
@@ -152,8 +148,8 @@ class _Rays:
         return [*sums, peak]
 
     def filtered(self, low: int, high: int, channels: range, down: range, across: range) -> list[mi.Float]:
-        """Return what the rays in each pixel give to the pixels at some offsets: by row and column of these,
-        and by channel."""
+        """What the rays in each pixel contribute to the pixels at some offsets: by row and column of the
+        offsets, and by channel."""
         evaluate = self.film.rfilter.eval
         pixel = dr.arange(mi.UInt32, high - low) + opaque(low)
         line, column = divide(pixel, self.film.width)
@@ -184,17 +180,20 @@ class _Rays:
     def gathered(
         self, sums: Sequence[mi.Float], low: int, high: int, begin: int, end: int, down: range, across: range
     ) -> list[mi.Float64]:
-        """Return by channel what reaches the pixels from ``begin`` to below ``end``; see ``filtered``."""
-        width, height = opaque(self.film.width), opaque(self.film.height)
+        """What reaches the pixels from ``begin`` to below ``end``, by channel; see ``filtered``."""
+        width = opaque(self.film.width)
+        height = opaque(self.film.height)
         pixel = dr.arange(mi.UInt32, end - begin) + opaque(begin)
         line, column = divide(pixel, self.film.width)
         row = divide(line, self.film.height)[1]
         # numbers below 0 wrap around, to numbers beyond all pixels
-        top, left = opaque(down[0] % 2**32), opaque(across[0] % 2**32)
+        top = opaque(down[0] % 2**32)
+        left = opaque(across[0] % 2**32)
         count = len(sums) // (len(down) * len(across))
         totals = [mi.Float64(0)] * count
         for number, (i, j) in enumerate(product(range(len(down)), range(len(across)))):
-            below, right = top + i, left + j
+            below = top + i
+            right = left + j
             index = pixel - below * width - right - opaque(low)  # where the rays start
             reached = (row - below < height) & (column - right < width) & (index < opaque(high - low))
             some = sums[number * count : (number + 1) * count]
@@ -204,5 +203,5 @@ class _Rays:
 
 
 def _parts(start: int, stop: int, most: int) -> list[range]:
-    """Cut a range into parts of at most so many."""
+    """A range cut into parts of at most so many numbers."""
     return [range(at, min(at + most, stop)) for at in range(start, stop, most)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -9,8 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.errors import UsageError, warn
-from mrt_mitsuba.options import TARGET, check
+from mrt_mitsuba.errors import warn
 from mrt_mitsuba.plugins.parameters import ParameterError, integer, number
 from mrt_mitsuba.plugins.variants import construct_quietly, text_of
 from mrt_mitsuba.rendering.settings import MAX_SPP
@@ -190,15 +190,13 @@ def _goal(props: mi.Properties) -> Goal:
 
 def _target(props: mi.Properties) -> Target:
     value = props.get("target", 0.01)
-    try:
-        target = check("target", TARGET, value)
-    except UsageError:
-        target = None
-    if not isinstance(target, Target):
-        raise ParameterError(
-            f'mrt_adaptive: "target" is {value!r}, but must be a number > 0, or a percentage such as "2%"'
-        )
-    return target
+    with suppress(TypeError, ValueError):
+        target = Target.of(value)
+        if target.positive:
+            return target
+    raise ParameterError(
+        f'mrt_adaptive: "target" is {value!r}, but must be a number > 0, or a percentage such as "2%"'
+    )
 
 
 def _sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:

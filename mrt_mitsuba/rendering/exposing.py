@@ -76,7 +76,9 @@ class Groups:
 
         Yields the entries in each part, and their groups.
         """
-        every = self._with_entries_of(most)
+        every = self
+        if self.counts is not None and self.first is not None and self.counts.max(initial=0) > most:
+            every = self._cut_up(self.counts, self.first, most)
         count = len(every.pixels)
         ends = None if every.counts is None else np.cumsum(every.counts)
         start = 0
@@ -94,14 +96,12 @@ class Groups:
             before += some.count
             start = stop
 
-    def _with_entries_of(self, most: int) -> Groups:
+    def _cut_up(self, counts: np.ndarray, first: np.ndarray, most: int) -> Groups:
         """The same groups, with several entries for a pixel of more than ``most``."""
-        if self.counts is None or self.first is None or self.counts.max(initial=0) <= most:
-            return self
-        pieces = -(-self.counts // most)
+        pieces = -(-counts // most)
         number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        counts = np.minimum(np.repeat(self.counts, pieces) - most * number, most)
-        first = np.repeat(self.first, pieces) + self.size * most * number
+        counts = np.minimum(np.repeat(counts, pieces) - most * number, most)
+        first = np.repeat(first, pieces) + self.size * most * number
         return Groups(self.size, np.repeat(self.pixels, pieces), counts, first)
 
     def lanes(self) -> tuple[mi.UInt32, mi.UInt32]:
@@ -353,22 +353,21 @@ class Exposer:
         log.debug("tracing %d rays, at most %d at once", groups.rays, most)
         for part, some in groups.parts(max(1, most // groups.size), width):
             heed()
-            trace = self._one_by_one if mi.variant().startswith("scalar") else self._at_once
-            place, values = trace(some, starts)
+            place: Any
+            values: Values
+            if mi.variant().startswith("scalar"):
+                place, values = self._one_by_one(some, starts)
+            else:
+                place, values = self.trace(*some.lanes(), starts, some.before)
+                if self.film is not None and not self.film.reach:
+                    place = None  # a box takes all rays of a pixel alike
+                dr.eval(place, values)
             self.job.rays["primary"] += some.rays
             for name, planes in values.items():
                 kind = TABLE[name].counts if name in TABLE else ""
                 if kind:
                     self.job.rays[kind] += round(float(np.sum(np.asarray(planes[0]), dtype=np.float64)))
             yield part, some, place, values
-
-    def _at_once(self, groups: Groups, starts: Starts) -> tuple[mi.Point2f, Values]:
-        """Trace rays in one wavefront."""
-        place, values = self.trace(*groups.lanes(), starts, groups.before)
-        if self.film is not None and not self.film.reach:
-            place = None  # a box takes all rays of a pixel alike
-        dr.eval(place, values)
-        return place, values
 
     def _one_by_one(self, groups: Groups, starts: Starts) -> tuple[np.ndarray, Values]:
         """Trace rays in a loop, as scalar variants do."""

@@ -42,7 +42,6 @@ class Passes:
         self._plan = plan
         self._phase = frame / plan.moments if plan.frames > 1 else None  # None: as the places say
         self._seed = plan.seed + 2 * frame  # two passes in a frame, each with random numbers of its own
-        self._pixels = _numbers(plan.seen, plan.width)  # of what is seen, in the whole picture
         self._seen = plan.seen.inside(Region(0, 0, plan.width, plan.height))
         self.layers: dict[str, np.ndarray] = {}
         self.error: ErrorEstimate | None = None
@@ -51,9 +50,10 @@ class Passes:
     def run(self) -> dict[str, np.ndarray]:
         """Run the passes of the plan; return the layers."""
         stack: Stack | None = None  # of what a film has been exposed to
+        seen = self._plan.seen
         for step in self._plan.passes:
             if isinstance(step, Edges | Blur):
-                with self._job.stage(step.name, len(self._pixels)) as advance:
+                with self._job.stage(step.name, seen.width * seen.height) as advance:
                     if isinstance(step, Edges):
                         self._detect(step.detector, advance)
                     else:
@@ -78,14 +78,20 @@ class Passes:
         """Trace samples of a lattice: their means are new layers or, at edges, are averaged with these."""
         phase = step.places.phase if self._phase is None else self._phase
         places = replace(step.places, seed=self._seed, phase=phase)
-        pixels = self._pixels
+        seen = self._plan.seen
+        width = self._plan.width
+        count = seen.width * seen.height
+        pixels: Any = range(seen.y * width, (seen.y + seen.height) * width)
         edge = None
         seed = self._seed
         if isinstance(step, Refinement):
             edge = np.flatnonzero(self.layers["samples"] > 1).astype(np.uint32)
-            pixels = edge + np.uint32(pixels.start) if isinstance(pixels, range) else pixels[edge]
             seed += 1
-        layers = {name: self._layer(name).reshape(len(self._pixels), -1) for name in exposer.layers}
+        if edge is not None or seen.width != width:
+            inside = np.arange(count, dtype=np.uint32) if edge is None else edge
+            row, column = np.divmod(inside, np.uint32(seen.width))
+            pixels = (row + np.uint32(seen.y)) * np.uint32(width) + column + np.uint32(seen.x)
+        layers = {name: self._layer(name).reshape(count, -1) for name in exposer.layers}
         starts = exposer.lattice(places, seed)
         with self._job.stage(step.name, len(pixels)) as advance:
             exposer.average(Groups(places.size, pixels), starts, layers, edge, advance)
@@ -230,12 +236,3 @@ class Passes:
             planes = np.zeros((*shape, channels) if name == "image" else (channels, *shape), np.float32)
             self.layers[name] = planes if name == "image" else np.moveaxis(planes, 0, -1)
         return self.layers[name]
-
-
-def _numbers(seen: Region, width: int) -> Any:
-    """The numbers of the pixels of a region in a picture, row by row; as a range where that is possible."""
-    if seen.width == width:
-        return range(seen.y * width, (seen.y + seen.height) * width)
-    rows = np.arange(seen.y, seen.y + seen.height)[:, None]
-    columns = np.arange(seen.x, seen.x + seen.width)
-    return (rows * width + columns).ravel().astype(np.uint32)

@@ -267,8 +267,8 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
 
     Raises ``UsageError`` for options that do not go together, and for layers that nothing provides.
     """
-    _check(settings, source, shader)
     choices = _decide(settings, source, shader)
+    _check(choices, source, shader)
     film = shader.film
     on_film = choices.lattice == FILM
     asked, possible = _layers(choices, shader)
@@ -346,9 +346,10 @@ def _traced(asked: frozenset[str], choices: _Choices, shader: Shader) -> frozens
     return frozenset(traced)
 
 
-def _check(settings: RenderSettings, source: Source, shader: Shader) -> None:
+def _check(choices: _Choices, source: Source, shader: Shader) -> None:
     """Raise ``UsageError`` for options that do not go together."""
-    goal = settings.goal(source.goal)
+    settings = choices.settings
+    goal = choices.goal
     if goal is None:
         only = "{0} is of use only where rays go in rounds: with target or aamode=noise"
         _refuse(settings, ("maxspp", "maxseconds", "on_round"), (), only)
@@ -365,10 +366,9 @@ def _check(settings: RenderSettings, source: Source, shader: Shader) -> None:
         alone = f"the integrator {shader.name} gives whole pictures, and no single rays"
         leave = f"{{0}}={{1}}: {alone}; leave it out, or choose another, such as path"
         _refuse(settings, ("aamode", "lattice", "motion"), ("none", NOISE, FILM), leave)
-        distance, _ = settings.focus(source.focal_distance, source.focal_range)
-        if distance is not None:
+        if choices.focaldist:
             raise UsageError(
-                f"focaldist={distance}: {alone}; write focaldist=0, or choose another, such as path"
+                f"focaldist={choices.focaldist}: {alone}; write focaldist=0, or choose another, such as path"
             )
     x, y, width, height = settings.region or (0, 0, 1, 1)
     if x + width > source.width or y + height > source.height:
