@@ -72,7 +72,7 @@ def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
         difference = np.abs(ours - original.image)
         for axes, picture in zip(row, (original.image, ours, 100 * difference), strict=True):
             show_picture(axes, picture)
-        row[0].set_ylabel(f"scene {scene}", **diagrams.WORDS)
+        row[0].set_ylabel(f"scene {scene}")
         off = (difference.max(axis=-1) > 1 / 255).mean()
         rows.append(
             {
@@ -89,6 +89,10 @@ def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
 def show_picture(axes: Any, picture: np.ndarray, tonemap: str = "report") -> None:
     """Show a linear picture [H, W, 3], by default as the report writes it."""
     axes.imshow(to_8bit(np.ascontiguousarray(picture, np.float32), tonemap), interpolation="nearest")
+    _unframe(axes)
+
+
+def _unframe(axes: Any) -> None:
     axes.set(xticks=[], yticks=[], anchor="N")
     axes.spines[:].set_visible(False)
 
@@ -106,52 +110,40 @@ def maps(result: mrt.Result) -> list[Figure]:
 
 def show_map(axes: Any, values: np.ndarray) -> None:
     """Show positive values [H, W] in colours, on a scale of logarithms."""
-    from matplotlib.colors import LogNorm
-    from matplotlib.ticker import LogLocator
-
     least, most = np.quantile(values[values > 0], (0.05, 1))
-    shown = axes.imshow(np.maximum(values, least), cmap="viridis", norm=LogNorm(least, most))
-    subs = (1, 2, 5) if most < 200 * least else (1,)
-    ticks: Any = {"ticks": LogLocator(subs=subs), "format": "%g"}
-    bar = axes.figure.colorbar(shown, ax=axes, location="bottom", fraction=0.05, pad=0.02, **ticks)
-    bar.minorticks_off()
-    axes.set(xticks=[], yticks=[], anchor="N")
-    axes.spines[:].set_visible(False)
+    shown = axes.imshow(np.maximum(values, least), cmap="viridis", norm="log", vmin=least, vmax=most)
+    bar = axes.figure.colorbar(shown, ax=axes, location="bottom", fraction=0.05, pad=0.02)
+    diagrams.plain_numbers(bar.ax.xaxis)
+    _unframe(axes)
 
 
-def tenths(scene: Any, *, seeds: int, truth_spp: int, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+def tenths(scene: Any, *, seeds: int, truth_spp: int, spp: int = 64) -> tuple[np.ndarray, np.ndarray]:
     """The stated and the true error of tenths of the pixels [10], sorted by the stated one.
 
-    ``options``: of renders in rounds, one for each seed. The noise of the truth is taken off its squares.
+    Of renders by ``path`` with a mean of ``spp`` rays a pixel where they are needed, one for each seed. The
+    noise of the truth is subtracted from its squares.
     """
-    chosen = mi.load_dict({"type": options["integrator"]})
-    parts = [
-        np.array(mi.render(scene, integrator=chosen, spp=truth_spp // 8, seed=1000 + k))[..., :3]
-        for k in range(8)
-    ]
+    path = mi.load_dict({"type": "path"})
+    parts = [mi.render(scene, integrator=path, spp=truth_spp // 8, seed=1000 + k) for k in range(8)]
     truth, noise = averaged(parts)
-    stated = []
-    true = []
+    stated: list[np.ndarray] = []
+    true: list[np.ndarray] = []
     for seed in range(seeds):
-        result = mrt.render(scene, seed=seed, progress=Progress(), **options)
+        result = mrt.render(scene, integrator="path", aamode="noise", spp=spp, seed=seed, progress=Progress())
         stated.append(np.square(result.layers["error.Y"]))
         true.append(np.square(result.image - truth).mean(axis=-1) - noise)
     order = np.array_split(np.argsort(stated, axis=None), 10)
-    return tuple(  # type: ignore[return-value]
-        np.array([max(np.ravel(squares)[part].mean(), 1e-12) ** 0.5 for part in order])
-        for squares in (stated, true)
-    )
+
+    def errors(squares: list[np.ndarray]) -> np.ndarray:
+        means = [np.ravel(squares)[part].mean() for part in order]
+        return np.sqrt(np.maximum(means, 1e-12))
+
+    return errors(stated), errors(true)
 
 
-def stated_and_true(
-    scenes: Mapping[str, Any], *, seeds: int = 8, truth_spp: int = 2048, **options: Any
-) -> Figure:
-    """A plot of the true over the stated error of tenths of the pixels, a line for each scene.
-
-    ``scenes``: loaded ones by name; ``options``: by default a mean of 64 rays of ``path`` where needed.
-    """
-    given = {"integrator": "path", "aamode": "noise", "spp": 64, **options}
-    found = {n: tenths(s, seeds=seeds, truth_spp=truth_spp, **given) for n, s in scenes.items()}
+def stated_and_true(scenes: Mapping[str, Any], *, seeds: int = 8, truth_spp: int = 2048) -> Figure:
+    """A plot of the true over the stated error of tenths of the pixels, a line for each loaded scene."""
+    found = {name: tenths(scene, seeds=seeds, truth_spp=truth_spp) for name, scene in scenes.items()}
     drawn, axes = diagrams.panel("tenths of the pixels, sorted by stated error", 4.6, 4.0)
     ends = {}
     for (name, (stated, true)), color in zip(found.items(), diagrams.COLORS, strict=False):
@@ -162,13 +154,7 @@ def stated_and_true(
     axes.plot(span, span, color=diagrams.TEXT, linewidth=0.8)
     axes.fill_between(span, span / 3, span * 3, color="0.93", zorder=0)
     axes.set(xscale="log", yscale="log", xlim=span, ylim=span, xlabel="stated error", ylabel="true error")
-    diagrams.plain_numbers(axes)
-    note: dict[str, Any] = {
-        "fontsize": diagrams.LABELS,
-        "color": diagrams.GREY,
-        "transform": axes.transAxes,
-        "va": "top",
-    }
-    axes.text(0.03, 0.97, "grey: within a factor of 3", **note)
+    diagrams.plain_numbers(axes.xaxis, axes.yaxis)
+    diagrams.note(axes, 0.03, 0.97, "grey: within a factor of 3", va="top")
     diagrams.label_ends(axes, ends)
     return drawn

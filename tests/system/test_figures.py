@@ -104,12 +104,11 @@ def test_the_original_and_ours_are_alike_in_the_figure():
 def test_stated_errors_are_true_in_the_figure():
     scene = mi.cornell_box()
     scene["sensor"]["film"] |= {"width": 24, "height": 24}
-    options = {"integrator": "path", "aamode": "noise", "spp": 32}
-    stated, true = figures.tenths(mi.load_dict(scene), seeds=3, truth_spp=512, **options)
+    stated, true = figures.tenths(mi.load_dict(scene), seeds=3, truth_spp=512, spp=32)
     ratio = true / stated
     assert len(ratio) == 10
     assert ratio[2:].min() > 1 / 3 and ratio.max() < 3  # the darkest pixels see no noise to speak of
-    result = mrt.render(scene, **options)
+    result = mrt.render(scene, integrator="path", aamode="noise", spp=32)
     assert [len(drawn.axes) for drawn in figures.maps(result)] == [2, 2]  # each with its bar of colours
 
 

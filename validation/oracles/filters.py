@@ -1,15 +1,13 @@
 """The filters in plain float64, as the truth for the fast ones.
 
-Written to be read next to the definitions, and for finite numbers only: detectors by SciPy's filters, the
-original's blur one pixel after the other, the corrected one one neighbour after the other.
+Written to be read next to the definitions, and for finite numbers only: detectors by SciPy's filters,
+both blurs one pixel after the other.
 
 A detector gives [H, W] arrays: mask, value, and margin, the distance of the value from the threshold. Where
 that is below the rounding error of float32, a float32 detector may decide otherwise.
 """
 
 from __future__ import annotations
-
-from itertools import product
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, sobel
@@ -75,30 +73,31 @@ def corrected_dof(image: Array, radius: Array) -> Array:
     level, spreads over its own disc; what is behind is seen through the pixel's, and in the same layer only
     through the narrower of both.
     """
-    rows, columns = radius.shape
-    steps = list(product(range(-5, 6), repeat=2))
+    steps = np.arange(-5, 6)
     radii = np.pad(radius, 5, mode="edge")
-    picture = np.dstack([image, np.ones(radius.shape)])
-    picture = np.pad(picture, ((5, 5), (5, 5), (0, 0)), mode="edge")
-    # the share of its light that a disc has in each pixel around it [H + 10, W + 10, steps]
-    discs = np.clip(abs(radii)[..., None] + 1 - np.hypot(*np.transpose(steps)), 0, 1)
-    discs /= discs.sum(axis=-1, keepdims=True)
-    front, same, behind = np.zeros((3, rows, columns, 4))
-    for step, (dx, dy) in enumerate(steps):
-        there = np.s_[5 + dy : 5 + dy + rows, 5 + dx : 5 + dx + columns]
-        light = picture[there]
-        order = (radii[there] - radius)[..., None]
-        own_disc = discs[5:-5, 5:-5, step, None]
-        their_disc = discs[there][..., step, None]
-        wider_behind = (order > 0) & (abs(radii[there]) > abs(radius))[..., None]
-        front += np.clip(-order, 0, 1) * their_disc * light
-        same += np.maximum(1 - abs(order), 0) * np.where(wider_behind, own_disc, their_disc) * light
-        behind += np.clip(order, 0, 1) * own_disc * light
-    hidden = np.minimum(front[..., 3:], 1)
-    solid = np.minimum(same[..., 3:], 1)
-    gap = np.minimum(1 - solid, behind[..., 3:])
-    colors = [layer[..., :3] / np.maximum(layer[..., 3:], 1e-300) for layer in (front, same, behind)]
-    return hidden * colors[0] + (1 - hidden) * (solid * colors[1] + gap * colors[2]) / (solid + gap)
+    picture = np.pad(np.float64(image), ((5, 5), (5, 5), (0, 0)), mode="edge")
+    # the share of its light that a disc has in each pixel around it [H + 10, W + 10, 11, 11]
+    discs = np.clip(abs(radii)[..., None, None] + 1 - np.hypot(steps[:, None], steps), 0, 1)
+    discs /= discs.sum(axis=(-2, -1), keepdims=True)
+    result = np.empty_like(picture[5:-5, 5:-5])
+    for y, x in np.ndindex(radius.shape):
+        window = np.s_[y : y + 11, x : x + 11]
+        own_disc = discs[y + 5, x + 5]
+        their_disc = np.einsum("yxyx->yx", discs[window])
+        order = radii[window] - radius[y, x]
+        wider_behind = (order > 0) & (abs(radii[window]) > abs(radius[y, x]))
+        front = np.clip(-order, 0, 1) * their_disc
+        same = np.maximum(1 - abs(order), 0) * np.where(wider_behind, own_disc, their_disc)
+        behind = np.clip(order, 0, 1) * own_disc
+        hidden = min(front.sum(), 1)
+        solid = min(same.sum(), 1)
+        gap = min(1 - solid, behind.sum())
+        first, second, third = (
+            np.einsum("yx,yxc->c", weight, picture[window]) / max(weight.sum(), 1e-300)
+            for weight in (front, same, behind)
+        )
+        result[y, x] = hidden * first + (1 - hidden) * (solid * second + gap * third) / (solid + gap)
+    return result
 
 
 def _inside(mask: Array, value: Array, margin: Array) -> Edges:

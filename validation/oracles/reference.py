@@ -26,6 +26,7 @@ from mrt_mitsuba.scene.model import Cone, Cylinder, Mesh, Plane, Scene, Sphere
 # point: far above the rounding of float64, far below anything a float32 picture can show
 OFFSET = 1e-10
 BATCH = 2**20  # pairs of a ray and a triangle at a time
+NOTHING = (1, 1, 0, 0, 0)  # index, roughness and colour of what a ray meets that meets no object
 HASH = np.uint64(0x9E3779B97F4A7C15)  # odd, so that no step of the hash loses information
 
 Array = np.ndarray
@@ -90,18 +91,18 @@ def _radiance(
 ) -> tuple[Array, Array, Array]:
     """The light [N, 3] that comes back along rays, and the hashes of their paths and lights [N]."""
     things = objects(scene)
-    numbers = np.array([(m.material.ior, m.material.alpha, *m.material.specular) for m in things])
+    materials = [thing.material for thing in things]
+    numbers = np.array([*((m.ior, m.alpha, *m.specular) for m in materials), NOTHING])
     light = np.zeros(d.shape)
     path, lights = np.zeros((2, len(d)), np.uint64)
     rays = [np.arange(len(d)), np.ones(d.shape), np.zeros(len(d), int), o, d]
     while len(rays[0]):
         ray, weight, spent, o, d = rays
-        t, thing, n, diffuse = nearest(things, o, d)
+        t, thing, n, diffuse = nearest(things, o, d)  # where nothing is met, n = 0 faces no light
         path[ray] = _mix(path[ray], thing)
-        hit = thing >= 0
-        light[ray[~hit]] += weight[~hit] * scene.sky
-        ray, weight, spent, o, d, t, n, diffuse = (x[hit] for x in (ray, weight, spent, o, d, t, n, diffuse))
-        ior, alpha, *specular = numbers.reshape(-1, 5)[thing[hit]].T
+        missed = thing < 0
+        light[ray[missed]] += weight[missed] * scene.sky
+        ior, alpha, *specular = numbers[thing].T
         p = o + t[:, None] * d
         cos = -dot(n, d)
         specular = np.transpose(specular)
@@ -250,11 +251,11 @@ def _(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
     """Closed cones, from the apex to the base, and cylinders: from the first end on, the radius is
     ``start + slope height``."""
     cone = isinstance(thing, Cone)
-    first, other = (thing.apex, thing.base_center) if isinstance(thing, Cone) else (thing.p0, thing.p1)
+    first, other, radius, _ = vars(thing).values()
     length = norm(np.subtract(other, first))
     axis = np.subtract(other, first) / length
-    start = 0.0 if cone else thing.radius
-    slope = (thing.radius - start) / length
+    start = 0.0 if cone else radius
+    slope = (radius - start) / length
     passed = -dot(o - first, d)  # from where the ray is nearest to the first end
     off = o - first + passed[:, None] * d
     height = off @ axis
@@ -272,7 +273,7 @@ def _(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
     h = height + side * rise
     side[~((h >= 0) & (h <= length))] = np.inf
     discs = np.stack([(length - height) / rise, -height / rise])
-    discs[norm(across + discs[..., None] * drift, axis=-1) > thing.radius] = np.inf
+    discs[norm(across + discs[..., None] * drift, axis=-1) > radius] = np.inf
     parts = _ahead(passed + np.concatenate([side, discs[: 2 - cone]]))
     part = parts.argmin(axis=0)
     t = parts.min(axis=0)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.command.tools import read_toml
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError
+from mrt_mitsuba.options import NUMBER, SWITCH
+from mrt_mitsuba.options import check as checked
 from mrt_mitsuba.rendering.progress import TerminalProgress
 from mrt_mitsuba.validation.tools.study import Bound, prepare_folder
 
@@ -20,7 +21,7 @@ def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: s
     """Compare two EXR files; return 0, or 1 beyond a limit. Raises ``UsageError`` if they do not compare."""
     from mrt_mitsuba.validation.tools.compare import UNDEFINED, compare
 
-    wanted = {name: _number(name, text) for name, text in limits.items()}
+    wanted = {name: checked(name, NUMBER, text, text=True) for name, text in limits.items()}
     try:
         found = compare(a, b, layer=layer)
         if out is not None:
@@ -40,11 +41,12 @@ def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: s
 
 def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
     """Check a scene; return 0 where every law holds, 1 where one does not."""
-    if quick not in ("0", "1"):
-        raise UsageError(f"quick={quick}: must be 0 or 1")
     from mrt_mitsuba.validation.checks.scene import check_scene
 
-    settings = {"quick": quick == "1", "progress": TerminalProgress(unit="plugin")}
+    settings = {
+        "quick": checked("quick", SWITCH, quick, text=True),
+        "progress": TerminalProgress(unit="plugin"),
+    }
     return int(not _found(check_scene, scene, settings, out, scene).passed)
 
 
@@ -76,10 +78,3 @@ def _found(
         found.save(out)
         print(f"Report: {Path(out) / 'index.html'}")
     return found
-
-
-def _number(name: str, text: str) -> float:
-    with suppress(ValueError):
-        if (value := float(text)) >= 0:
-            return value
-    raise UsageError(f"{name}={text}: must be a number from 0 on")

@@ -22,7 +22,7 @@ from mrt_mitsuba.rendering.api import Result
 
 Array = np.ndarray
 Picture = Any  # the path of an EXR, an array or the result of a render
-ORDER = "RGBXYZUVA"  # of channels within a layer; others follow
+ORDER = "RGBXYZUVA"  # of channels within a layer, after others
 ROUNDING = 1e-5  # relative size of differences that are float32's: sums in another order, fused operations
 EPSILON = 0.01  # keeps black pixels, which no relative error describes, from ruling it
 CELL = 16  # pixels, a side of the cells whose means are compared
@@ -89,7 +89,7 @@ class Difference:
         write_exr(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures().items()})
         size = abs(values).max(axis=2)
         scale = np.max(size, initial=0, where=np.isfinite(size)) or 1
-        colors = colormaps["inferno"](np.minimum(size / scale, 1))
+        colors = colormaps["inferno"](size / scale)  # what is above 1 as 1
         write_png(f"{stem}.png", np.float32(colors[..., :3]))
 
     def __str__(self) -> str:
@@ -174,7 +174,7 @@ def read_layer(source: Picture, layer: str = "", name: str = "the picture") -> L
 def _layer_of(channels: Mapping[str, Array], headers: Mapping[str, Any], layer: str, name: str) -> Layer:
     """A layer of channels by name, with its variance and window where they are known."""
     groups: dict[str, list[str]] = {}  # channels by layer, in order
-    for key in sorted(channels, key=lambda key: ((ORDER + key[-1]).index(key[-1]), key)):
+    for key in sorted(channels, key=lambda key: (ORDER.find(key[-1]), key)):
         groups.setdefault(key.rpartition(".")[0] or key, []).append(key)
     picture = [c for c in "RGB" if c in channels] or [*channels.keys() & {"Y"}]
     keys = picture if not layer else [layer] if layer in channels else groups.get(layer)
@@ -254,11 +254,11 @@ def _p_of_means(difference: Array) -> float:
 # ------------------------------------------ Sets of renders ------------------------------------------
 
 
-def p_values(ours: ArrayLike, theirs: ArrayLike, *, tile: int = 16) -> dict[str, float]:
+def p_values(ours: ArrayLike, theirs: ArrayLike) -> dict[str, float]:
     """Compare two sets of two or more independent renders [N, H, W, C].
 
     Return the p values of three questions, each with power where the others have little: does any single
-    "pixel" differ (a dropped light, a flipped normal), does any "tile" of ``tile`` × ``tile`` pixels (a wrong
+    "pixel" differ (a dropped light, a flipped normal), does any "tile" of ``CELL`` × ``CELL`` pixels (a wrong
     roughness), does the whole "image" (a scale of 1.02)? By Welch's t-test with Šidák's correction for
     all that is asked: of equal pictures, the least of the three is below a level as often as the level says.
     Differences of a relative size of ``ROUNDING`` do not count.
@@ -272,7 +272,7 @@ def p_values(ours: ArrayLike, theirs: ArrayLike, *, tile: int = 16) -> dict[str,
     if not all(np.isfinite(s).all() for s in sides):
         raise UsageError("renders hold infinite or undefined values")
     light = np.maximum(*(abs(s.mean(axis=0)) for s in sides))
-    sizes = {"pixel": 1, "tile": tile, "image": max(light.shape)}
+    sizes = {"pixel": 1, "tile": CELL, "image": max(light.shape)}
     found = {}
     for name, size in sizes.items():
         floor = ROUNDING * cell_sums(light + light.mean(), size) + 1e-30

@@ -11,8 +11,8 @@ import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
-
 
 # Those of ``work_precision``, which imports this module
 Findings = Any
@@ -41,6 +41,8 @@ def figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color(GREY)
         axes.tick_params(colors=TEXT, labelsize=LABELS)
+        axes.set_xlabel("", **WORDS)
+        axes.set_ylabel("", **WORDS)
     return drawn, plots
 
 
@@ -51,17 +53,23 @@ def panel(title: str, width: float = 5.0, height: float = 4.4) -> tuple[Figure, 
     return drawn, plots[0, 0]
 
 
-def plain_numbers(axes: Axes) -> None:
+def plain_numbers(*scales: Axis) -> None:
     """Write decimal numbers at logarithmic axes: 1, 2 and 5 of each decade, fewer if there are many."""
     from matplotlib.ticker import LogLocator, NullLocator
 
-    for scale in (axes.xaxis, axes.yaxis):
+    for scale in scales:
         least, most = scale.get_view_interval()
         span = most / least
         subs = (1, 2, 5) if span < 300 else (1, 3) if span < 1e4 else (1,)
         scale.set_major_locator(LogLocator(subs=subs))
         scale.set_major_formatter("{x:g}")
         scale.set_minor_locator(NullLocator())
+
+
+def note(axes: Axes, x: float, y: float, text: str, **looks: Any) -> None:
+    """Write a text into a plot, at a place in shares of its width and height."""
+    looks = {"fontsize": LABELS, "color": GREY, **looks}
+    axes.text(x, y, text, transform=axes.transAxes, **looks)
 
 
 def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float, str]]) -> None:
@@ -71,13 +79,11 @@ def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float, str]]) -> None
     """
     drawn: Any = axes.figure
     drawn.draw_without_rendering()  # places the axes
-    height = axes.get_window_extent().height
-    gap = 1.35 * LABELS * drawn.dpi / 72 / height
-    to_axes = axes.transAxes.inverted()
-    wanted = {name: to_axes.transform(axes.transData.transform(end[:2]))[1] for name, end in ends.items()}
-    names = sorted(wanted, key=wanted.__getitem__)
-    for name, place in zip(names, apart([wanted[name] for name in names], gap), strict=True):
-        x, y, color = ends[name]
+    gap = 1.35 * LABELS * drawn.dpi / 72 / axes.get_window_extent().height
+    to_axes = axes.transData - axes.transAxes
+    ascending = sorted(ends.items(), key=lambda end: end[1][1])
+    wanted = [to_axes.transform((x, y))[1] for _, (x, y, _) in ascending]
+    for (name, (x, y, color)), place in zip(ascending, apart(wanted, gap), strict=True):
         lead = {"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.7, "shrinkB": 3}
         axes.annotate(
             name,
@@ -112,9 +118,7 @@ def work_precision(title: str, found: Findings) -> Figure:
     intervals, the band at the bottom is the reference's own error.
     """
     drawn, axes = panel(title)
-    axes.set(xscale="log", yscale="log")
-    axes.set_xlabel("seconds of a warm render", **WORDS)
-    axes.set_ylabel("error (RMSE, linear)", **WORDS)
+    axes.set(xscale="log", yscale="log", xlabel="seconds of a warm render", ylabel="error (RMSE, linear)")
     points = list(found.points.values())
     best = frontier(points)
     errors = [error for error in (found.reference_error, *(p.rmse for p in points)) if error]
@@ -139,16 +143,14 @@ def work_precision(title: str, found: Findings) -> Figure:
         # without names that only numbers followed
         shown = [word for word in words if f"{word}=" not in curve[-1].name]
         ends[" ".join(shown or words)] = (*at[:, -1], color)
-    own_words: Any = {"transform": axes.transAxes, "fontsize": LABELS - 1.5, "color": GREY}
     if found.reference_error:
         axes.axhspan(bottom / 10, found.reference_error, color="0.92", zorder=0)
-        axes.text(0.02, 0.01, "within the reference's own error", **own_words)
+        note(axes, 0.02, 0.01, "within the reference's own error", fontsize=LABELS - 1.5)
     seconds, shown_errors = places(points)
     axes.set_xlim(seconds.min() / 2.5, seconds.max() * 1.3)  # intervals may go on beyond
     axes.set_ylim(0.8 * bottom, 1.6 * shown_errors.max())
-    plain_numbers(axes)
-    top_right = own_words | {"ha": "right", "va": "top", "fontsize": LABELS, "color": "#a67c00"}
-    axes.text(0.98, 0.98, "the best at each error", **top_right)
+    plain_numbers(axes.xaxis, axes.yaxis)
+    note(axes, 0.98, 0.98, "the best at each error", ha="right", va="top", color="#a67c00")
     axes.grid(alpha=0.25)
     _name_points(axes, best, places(best).T)
     label_ends(axes, ends)

@@ -24,12 +24,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import PIL.Image
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import OutputError, needs_extra
 from mrt_mitsuba.machine import usable_cores
-from mrt_mitsuba.output.files import to_8bit
+from mrt_mitsuba.output.files import png
 from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.rendering.progress import Progress
 
@@ -324,17 +323,16 @@ def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[st
 
 def _drawn(content: Any) -> Values:
     """The bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
-    buffer = io.BytesIO()
     if isinstance(content, np.ndarray):
         kind = "picture"
         broad = content.shape[1] > 2 * len(content)
-        PIL.Image.fromarray(to_8bit(np.float32(content), "srgb")).save(buffer, format="PNG")
+        data = png(content)
     else:
-        # inches
         kind = "plot"
-        broad = content.get_figwidth() > 6.5
+        broad = content.get_figwidth() > 6.5  # inches
+        buffer = io.BytesIO()
         content.savefig(buffer, format="png", dpi=110, bbox_inches="tight", facecolor="white")
-    data = buffer.getvalue()
+        data = buffer.getvalue()
     return {"data": data, "base64": base64.b64encode(data).decode(), "kind": kind, "broad": broad}
 
 

@@ -40,15 +40,8 @@ LEVEL = 0.95  # of all intervals
 Options = Mapping[str, Any]
 Given = Any  # a scene, as ``render`` takes it, or a reference
 Run = Callable[[Options, int], Result]  # a render with options and a seed
+Timed = tuple[Result, float]  # a render, and its seconds without loading the scene
 Interval = tuple[float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Timed:
-    """A render and its time."""
-
-    result: Result
-    seconds: float  #: without loading the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,12 +154,12 @@ class Findings:
 
         The interval is from where the lower ends of all intervals come so low to where the upper ends do.
         """
-
-        def crossings(points: Sequence[Point]) -> tuple[float, ...]:
-            curves = [[(p.seconds, *p.seconds_interval), (p.rmse, *p.rmse_interval)] for p in points]
-            return tuple(_crossing(at, down_to, error) for at, down_to in np.transpose(curves, (2, 1, 0)))
-
-        return {name: crossings(points) for name, points in self.families.items()}
+        times = {}
+        for name, points in self.families.items():
+            seconds = np.transpose([(p.seconds, *p.seconds_interval) for p in points])  # [3, points]
+            errors = np.transpose([(p.rmse, *p.rmse_interval) for p in points])
+            times[name] = tuple(_crossing(*curve, error) for curve in zip(seconds, errors, strict=True))
+        return times
 
     @property
     def verdicts(self) -> list[str]:
@@ -193,18 +186,19 @@ class Findings:
     def advice(self) -> list[Values]:
         """A row for each of ``errors``: the case that gets there first, and the next other curve."""
         rows = []
+        fastest_first = sorted(self.points.values(), key=attrgetter("seconds"))
         for error in self.errors:
-            low = [p for p in self.points.values() if p.rmse <= error]
-            low.sort(key=attrgetter("seconds"))
-            others = [point for point in low if point.family != low[0].family]
-            row = {"to get to an error of": error, "use": "nothing comes so low"}
+            low = [p for p in fastest_first if p.rmse <= error]
+            others = [p for p in low if p.family != low[0].family]
+            row: Values = {"to get to an error of": error, "use": "nothing comes so low"}
             row |= {"seconds": None, "next best": None, "which takes": None}
             if low:
-                row |= {"use": low[0].name, "seconds": _shown(low[0].seconds, *low[0].seconds_interval)}
+                row["use"] = low[0].name
+                row["seconds"] = _shown(low[0].seconds, *low[0].seconds_interval)
             if others:
                 times = others[0].seconds / low[0].seconds
-                longer = f"{times:.2g} times as long" if times > 1.05 else "as long"
-                row |= {"next best": others[0].name, "which takes": longer}
+                row["next best"] = others[0].name
+                row["which takes"] = f"{times:.2g} times as long" if times > 1.05 else "as long"
             rows.append(row)
         return rows
 
@@ -322,7 +316,7 @@ def error_vs_time(
         inside = np.geomspace(max(known), min(known), ERRORS + 2)[1:-1]
         errors = list(dict.fromkeys(float(f"{1.05 * e:.1e}") for e in inside))
     return Findings(
-        scene=next((found[0].result.plan.scene for found in runs.values()), "scene"),
+        scene=next((result.plan.scene for (result, _), *_ in runs.values()), "scene"),
         points=points,
         failed=failed,
         reference=np.mean(halves, axis=0),
@@ -401,9 +395,12 @@ def _measure(
                 try:
                     if cold and turn == first:
                         dr.flush_kernel_cache()
-                    timed = _timed(run, cases[name], max(turn, 0), LEAST if turn >= 0 else 0.0)
-                    compare(_picture(timed.result), truth)  # raises for another size
-                    runs[name].append(timed)
+                    seconds: list[float] = []
+                    while not seconds or (turn >= 0 and sum(seconds) < LEAST):
+                        result = run(cases[name], max(turn, 0))
+                        seconds.append(result.timings.total - result.timings.load)
+                    compare(_picture(result), truth)  # raises for another size
+                    runs[name].append((result, float(np.mean(seconds))))
                 except Exception as error:
                     failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
                     del runs[name]
@@ -411,31 +408,22 @@ def _measure(
     return runs, failed
 
 
-def _timed(run: Run, options: Options, seed: int, least: float) -> Timed:
-    """Render once, or again until the renders take ``least`` seconds together."""
-    seconds: list[float] = []
-    while not seconds or sum(seconds) < least:
-        result = run(options, seed)
-        seconds.append(result.timings.total - result.timings.load)
-    return Timed(result, float(np.mean(seconds)))
-
-
 def _point(
     name: str, runs: Sequence[Timed], repeats: int, halves: Sequence[Array], own_error: float
 ) -> Point:
     """The figures of a case; its first run was cold, its last ``repeats`` count."""
-    counted = [timed.result for timed in runs[-repeats:]]
+    results, seconds = zip(*runs, strict=True)
+    counted = results[-repeats:]
     image = counted[0].image
     pictures = np.array([result.image for result in counted], np.float64)  # [repeats, H, W, 3]
     errors = [(pictures - half).reshape(len(pictures), -1) for half in halves]
     gram = errors[0] @ errors[1].T / errors[0].shape[1]
-    seconds = np.array([timed.seconds for timed in runs])
     return Point.of(
         name,
-        seconds[-repeats:],
+        np.array(seconds[-repeats:]),
         (gram + gram.T) / 2,
-        cold=float(seconds[0]),
-        compile=runs[0].result.timings.compile,
+        cold=seconds[0],
+        compile=results[0].timings.compile,
         rays=dict(counted[0].rays),
         image=image,
         difference=compare(image, np.mean(halves, axis=0)),
