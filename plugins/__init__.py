@@ -78,6 +78,11 @@ def class_of(row: Plugin) -> type:
     return getattr(plugin(row.module), row.class_name)
 
 
+def classes_of(table: str) -> tuple[Any, ...]:
+    """Return the classes, for the current variant, of the plugins in a table of the kernels."""
+    return tuple(class_of(row) for row in PLUGINS if row.table == table)
+
+
 def is_known(thing: object) -> bool:
     """Return whether Mitsuba or this folder has the class of an object, so that all its state is in sight.
 

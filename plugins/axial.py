@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import plugin
 from .intersect import Frame
 from .mesh_api import Placement, keep_apart, write_buffers
 from .parameters import ParameterError, flag, number, segments, vector
@@ -18,7 +17,7 @@ from .quadric_kinds import KINDS, QuadricTable
 from .variants import first, is_jit, updatable
 
 
-class AxialMesh(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
+class AxialMesh(mi.Mesh):
     """The base class of ``mrt_cone`` and ``mrt_cylinder`` (Mitsuba's classes take no mix-in).
 
     Parameters: the two points ``ends``, ``radius``, ``segments``, ``capped`` and ``to_world``.
@@ -41,31 +40,34 @@ class AxialMesh(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
             raise ParameterError(f'{name}: "face_normals" is not accepted; its side is round')
         self.placement = Placement(props)
         self.unit = KINDS[self.kind].mesh(segments(props, 256))
+        self.flipped = props.get("flip_normals", False)
+        self._place(*ends, [radius])
         vertices, faces = self.unit
-        #: the unit frame in world space, in double precision (see ``intersect``)
-        self.exact_frame = self._frame_of(vector64(ends[0]), vector64(ends[1]), radius)
         buffers = {"has_vertex_normals": True, "has_vertex_texcoords": True}
         mi.Mesh.__init__(self, name, len(vertices), len(faces), props, **buffers)
         uvs = vertices[:, 6:].astype(np.float32).ravel()
-        write_buffers(self, vertex_texcoords=uvs, **self.quadrics().stand_in(self.unit))
+        write_buffers(self, vertex_texcoords=uvs, **self.table.stand_in())
         parameters = dict(zip(self.ends, map(mi.Point3f, ends), strict=True))
         self.parameters = {**parameters, "radius": updatable(radius)}
         keep_apart(self, name, len(faces))
 
-    def _frame_of(self, p0, p1, radius) -> Frame:
-        return self.placement(KINDS[self.kind].frame(p0, p1, radius))
+    def _place(self, *parameters: Sequence) -> None:
+        """Make the table of the exact quadric, in double precision, from both ends and [radius]."""
+        numbers = np.array([[first(x) for values in parameters for x in values]])
+        self.table = QuadricTable(self.kind, numbers, self.placement, self.unit, flipped=self.flipped)
 
-    def quadrics(self) -> QuadricTable:
-        return QuadricTable.of_one(self.kind, self.exact_frame, flipped=self.has_flipped_normals())
+    def _frame(self) -> Frame:
+        """Return the unit frame in Mitsuba's numbers, with derivatives by the parameters."""
+        return self.placement(KINDS[self.kind].frame(*self.parameters.values()))
 
     def moving_frame(self) -> Frame | None:
-        values = list(self.parameters.values())
-        return self._frame_of(*values) if dr.grad_enabled(values) else None
+        """Return the unit frame with its derivatives; None where none are wanted."""
+        return self._frame() if dr.grad_enabled(list(self.parameters.values())) else None
 
     def looked_at(self) -> tuple[list, list, list]:
         """Return the state that a snapshot compares instead of all attributes: values, objects, arrays."""
         arrays = [*self.parameters.values(), self.vertex_positions_buffer(), self.faces_buffer()]
-        return [self.kind], [self.exact_frame, self.placement], arrays
+        return [self.kind], [self.table, self.placement], arrays
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         mi.Mesh.traverse(self, callback)
@@ -75,12 +77,11 @@ class AxialMesh(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         if not set(self.parameters).isdisjoint(keys):
-            p0, p1, radius = self.parameters.values()
-            self.exact_frame = self._frame_of(vector64(p0), vector64(p1), first(radius))
+            self._place(*self.parameters.values())
             if is_jit():
-                self._follow(self._frame_of(p0, p1, radius))
+                self._follow(self._frame())
             else:
-                write_buffers(self, **self.quadrics().stand_in(self.unit))
+                write_buffers(self, **self.table.stand_in())
         mi.Mesh.parameters_changed(self, keys)
 
     def _follow(self, frame: Frame) -> None:
@@ -94,7 +95,7 @@ class AxialMesh(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
         write_buffers(self, vertex_positions=positions, vertex_normals=normals)
 
     def to_string(self) -> str:
-        points = ", ".join(f"{name}={list(vector64(self.parameters[name]))}" for name in self.ends)
+        points = ", ".join(f"{name}={[*map(first, self.parameters[name])]}" for name in self.ends)
         radius = first(self.parameters["radius"])
         return f"{type(self).__name__}[{points}, radius={radius:g}, capped={self.capped}]"
 
@@ -179,8 +180,3 @@ class MrtCylinder(AxialMesh):
 
     kind = "cylinder"
     ends = ("p0", "p1")
-
-
-def vector64(v):
-    """Return three numbers, or a point or vector of one entry, in double precision."""
-    return dr.scalar.Array3f64([first(c) for c in v])

@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from . import is_known, plugin
+from . import classes_of, is_known, plugin
 from .kernel_plan import Mirror, SceneFacts
 from .lights import brightness
 from .lobes import LOBES, material_rows
@@ -25,10 +25,10 @@ LARGEST_MESH = 1e10
 class Reading:
     """A snapshot of a scene and what is read of it, by part; ``kept`` spares reading a part again.
 
-    What ``mrt_whitted`` may do in place of calling a plugin is known by its class: an ``MrtPlane`` has an
-    equation, an ``ExactMesh`` stands for quadrics, a light that derives from ``MrtLight`` is a row of a
-    table, and so is an ``MrtBSDF``. Somebody else's class derived from the latter three may do anything, and
-    is called.
+    What the kernels may do in place of calling a plugin is known by its class: an ``MrtPlane`` has an
+    equation, an ``AxialMesh`` or ``MrtGroup`` stands for quadrics, an ``MrtBSDF`` is a row of a table, and so
+    is a light that derives from ``MrtLight``. A class of somebody else's that derives from one of the others
+    may do anything, and is called.
     """
 
     def __init__(self, snapshot: Snapshot, kept: Kept) -> None:
@@ -37,8 +37,8 @@ class Reading:
         materials = snapshot.material_part
         lights = snapshot.light_part
         known = [s for s in snapshot.shapes if is_known(s)]
-        self.planes = [s for s in known if isinstance(s, plugin("plane").MrtPlane)]
-        self.quadrics = [s for s in known if isinstance(s, plugin("exact_mesh").ExactMesh)]
+        self.planes = [s for s in known if isinstance(s, classes_of("planes"))]
+        self.quadrics = [s for s in known if isinstance(s, classes_of("quadrics"))]
         analytic = {id(s) for s in (*self.planes, *self.quadrics)}
         self.native = [s for s in snapshot.shapes if id(s) not in analytic]
         #: the rows of the materials by shape, none where they have no place in one table
@@ -61,8 +61,8 @@ class Reading:
             _check_size(mesh)
         spheres = [s for s in self.native if is_sphere(s)]
         quadrics = Counter[str]()
-        for table in (s.quadrics() for s in self.quadrics):
-            quadrics[table.kind] += len(table.rows)
+        for shape in self.quadrics:
+            quadrics[shape.table.kind] += len(shape.table.rows)
         return {
             "vectorised": is_jit(),
             "native_shapes": len(self.native),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from . import plugin
 from .mesh_api import Placement, keep_apart, write_buffers
 from .parameters import ParameterError, choice, segments
 from .quadric_kinds import KINDS, QuadricTable
@@ -14,7 +13,7 @@ from .quadric_kinds import KINDS, QuadricTable
 CLOSED = tuple(name for name, kind in KINDS.items() if kind.closed)
 
 
-class MrtGroup(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
+class MrtGroup(mi.Mesh):
     r"""Many spheres, cones or cylinders as one shape, with per-object values for textures.
 
     Mitsuba takes about 0.1 ms for a native shape, 1 ms for one in Python, and traces the methods of each BSDF
@@ -51,21 +50,21 @@ class MrtGroup(plugin("exact_mesh").ExactMesh):  # type: ignore[misc]
         attributes = {name: _table(props, name) for name in props if name.startswith("face_")}
         self.content = f"kind={kind}, objects={len(numbers)}"
         unit = KINDS[kind].mesh(segments(props, 8))
+        flipped = props.get("flip_normals", False)
+        self.table = QuadricTable(kind, numbers, Placement(props), unit, flipped=flipped)
         vertices, faces = map(len, unit)
-        self.table = QuadricTable.of_numbers(
-            kind, numbers, faces, Placement(props), flipped=props.get("flip_normals", False)
-        )
         sizes = len(numbers) * vertices, len(numbers) * faces
         mi.Mesh.__init__(self, "mrt_group", *sizes, props, has_vertex_normals=True)
-        write_buffers(self, **self.table.stand_in(unit))
+        write_buffers(self, **self.table.stand_in())
         for name, values in attributes.items():
             if len(values) != len(numbers):
                 raise ParameterError(f'mrt_group: "{name}" has {len(values)} rows for {len(numbers)} objects')
             self.add_attribute(name, values.shape[1], np.repeat(values, faces, axis=0).ravel())
         keep_apart(self, "mrt_group", sizes[1])
 
-    def quadrics(self) -> QuadricTable:
-        return self.table
+    def moving_frame(self) -> None:
+        """Return None: a group has no differentiable parameters."""
+        return
 
     def to_string(self) -> str:
         return f"MrtGroup[{self.content}]"

@@ -110,13 +110,6 @@ class Tracer(Protocol):
     bounce_budget: str
 
 
-def bounce_cost(tracer: Tracer, int_ior: float) -> int:
-    """Return the cost of a bounce off a material of this index, a part of ``max_depth``."""
-    if tracer.bounce_budget == "plain":
-        return 1
-    return max(10 - int(np.float32(10) * np.float32(min(int_ior, 1))), 1)
-
-
 @dataclass
 class Case:
     """The ground for decisions: a scene, the integrator, and the decisions so far."""
@@ -141,11 +134,15 @@ class Case:
 
     def cost(self, mirror: Mirror) -> int:
         """Return the cost of a bounce off a mirror, a part of ``max_depth``."""
-        return bounce_cost(self.tracer, mirror.int_ior)
+        if self.tracer.bounce_budget == "plain":
+            return 1
+        return max(10 - int(np.float32(10) * np.float32(min(mirror.int_ior, 1))), 1)
 
 
 Reasons = dict[str, bool]  # against something, by whether they hold; the first that holds is given
 
+# What is decided, and the reasons against it
+Decision = tuple[Any, Reasons]
 
 # What kernels hold, in words: a format of ``facts`` and ``plan``, one for each value of the field, or a
 # function of facts and plan, which gives "" for nothing
@@ -154,34 +151,32 @@ Content = str | dict[str, str] | Callable[[SceneFacts, KernelPlan], str]
 
 @dataclass(frozen=True)
 class Rule:
-    """A decision."""
+    """How a decision is taken, and how it is put into words."""
 
     name: str  #: the field of the plan
     what: str  #: what is decided, in words
     content: Content
-    against: Callable[[Case], Reasons]
-    value: Callable[[Case, bool], Any]  # of the field, by whether there is no reason against it
+    decide: Callable[[Case], Decision]
 
 
 RULES: list[Rule] = []  #: in the order in which they are taken: later ones may ask for earlier decisions
 
 
-def _free(case: Case, free: bool) -> bool:
-    return free
-
-
 def rule(
-    name: str,
-    what: str,
-    content: Content,
-    value: Callable[[Case, bool], Any] = _free,
-) -> Callable[[Callable[[Case], Reasons]], None]:
-    """Put a decision into ``RULES``, by the function that gives the reasons against it."""
+    name: str, what: str, content: Content
+) -> Callable[[Callable[[Case], Decision]], Callable[[Case], Decision]]:
+    """Put a decision into ``RULES``, by the function that takes it."""
 
-    def add(against: Callable[[Case], Reasons]) -> None:
-        RULES.append(Rule(name, what, content, against, value))
+    def add(decide: Callable[[Case], Decision]) -> Callable[[Case], Decision]:
+        RULES.append(Rule(name, what, content, decide))
+        return decide
 
     return add
+
+
+def unless(reasons: Reasons) -> Decision:
+    """Decide for something where no reason against it holds."""
+    return not any(reasons.values()), reasons
 
 
 # ----------------------------------------------- The rules ---------------------------------------------
@@ -194,22 +189,19 @@ _SPHERES: Content = {
 }
 
 
-def _sphere_form(case: Case, free: bool) -> str:
-    if free:
-        return "table"
-    return "corrected" if case.facts.spheres else "none"
-
-
-@rule("spheres", "table of spheres", _SPHERES, _sphere_form)
-def _spheres(case: Case) -> Reasons:
+@rule("spheres", "table of spheres", _SPHERES)
+def _spheres(case: Case) -> Decision:
     facts = case.facts
-    return {
+    reasons = {
         "no sphere in the scene": facts.spheres == 0,
         SCALAR_VARIANT: not facts.vectorised,
         VARYING: facts.textured,
         "a material needs the frame along texture coordinates": facts.oriented,
         _OTHERS: facts.plain_spheres < facts.native_shapes,
     }
+    if not any(reasons.values()):
+        return "table", reasons
+    return "corrected" if facts.spheres else "none", reasons
 
 
 _LIGHTS: Content = {
@@ -219,54 +211,50 @@ _LIGHTS: Content = {
 }
 
 
-def _light_form(case: Case, free: bool) -> str:
+@rule("lights", "shadow rays", _LIGHTS)
+def _lights(case: Case) -> Decision:
     facts = case.facts
-    if not free:
-        return "none"
+    reasons = {"no light": facts.lights == 0, "every material is black": not case.lobes}
+    if any(reasons.values()):
+        return "none", reasons
     # Dr.Jit has no derivatives through a loop of such calls
     if facts.lights <= UNROLLED_LIGHTS or not facts.vectorised or facts.differentiated:
-        return "unrolled"
-    return "table" if facts.tabled else "loop"
-
-
-@rule("lights", "shadow rays", _LIGHTS, _light_form)
-def _lights(case: Case) -> Reasons:
-    return {"no light": case.facts.lights == 0, "every material is black": not case.lobes}
+        return "unrolled", reasons
+    return "table" if facts.tabled else "loop", reasons
 
 
 @rule("mirrors", "bounce loop", "mirror bounces")
-def _mirrors(case: Case) -> Reasons:
+def _mirrors(case: Case) -> Decision:
     brightest = max((m.reflectance for m in case.affordable), default=0.0) * case.arriving
-    return {
-        "max_depth admits no mirror ray": bool(case.facts.mirrors) and not case.affordable,
-        "no material reflects visibly": not brightest > case.tracer.min_contribution,
-    }
+    return unless(
+        {
+            "max_depth admits no mirror ray": bool(case.facts.mirrors) and not case.affordable,
+            "no material reflects visibly": not brightest > case.tracer.min_contribution,
+        }
+    )
 
 
 def _lobe_content(facts: SceneFacts, plan: KernelPlan) -> str:
     return f"lobes: {', '.join(plan.lobes)}"
 
 
-def _lobe_names(case: Case, free: bool) -> tuple[str, ...]:
-    return case.lobes
-
-
-@rule("lobes", "one of the lobes", _lobe_content, _lobe_names)
-def _lobes(case: Case) -> Reasons:
+@rule("lobes", "one of the lobes", _lobe_content)
+def _lobes(case: Case) -> Decision:
     missing = {f"no material has the {name} one": not present for name, present in reversed(case.facts.lobes)}
-    return {"every material is black": not case.lobes, **missing}
+    return case.lobes, {"every material is black": not case.lobes, **missing}
 
 
 def _cut_off_content(facts: SceneFacts, plan: KernelPlan) -> str:
     return "an end of paths too dim to be seen" if 0 < plan.cut_off[0] < math.inf else ""
 
 
-def _cut_off_bounds(case: Case, free: bool) -> tuple[float, float]:
-    """Return the bound of what may still arrive along a path, and that of what lights bring.
+@rule("cut_off", "cut-off", _cut_off_content)
+def _cut_off(case: Case) -> Decision:
+    """Bound what may still arrive along a path, and what lights bring.
 
-    Both count the hits of a path, weighted by its throughput at normal incidence. It is one where materials
-    reflect less than a half there: what is left out at further hits adds less than as much again. Where
-    mirrors face each other, it adds up.
+    Both bounds count the hits of a path, weighted by its throughput at normal incidence. It is one where
+    materials reflect less than a half there: what is left out at further hits adds less than as much again.
+    Where mirrors face each other, it adds up.
     """
     mirrors = case.affordable if case.made["mirrors"] else []
     hits = 1.0
@@ -274,23 +262,20 @@ def _cut_off_bounds(case: Case, free: bool) -> tuple[float, float]:
     if reflectance > 0.5:
         bounces = (case.tracer.max_depth - 2) // min(map(case.cost, mirrors)) + 1
         hits = sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
-    return case.arriving * hits if case.made["mirrors"] else 0.0, case.facts.lights * hits
-
-
-@rule("cut_off", "cut-off", _cut_off_content, _cut_off_bounds)
-def _cut_off(case: Case) -> Reasons:
+    along_path = case.arriving * hits if case.made["mirrors"] else 0.0
     unbounded = case.made["mirrors"] and case.arriving == math.inf
-    return {"what may still arrive has no known bound": unbounded}
+    reasons = {"what may still arrive has no known bound": unbounded}
+    return (along_path, case.facts.lights * hits), reasons
 
 
 @rule("bvh", "BVH", "{facts.native_shapes} shapes in Mitsuba's BVH")
-def _bvh(case: Case) -> Reasons:
-    return {"no shapes but analytic ones": case.facts.native_shapes == 0}
+def _bvh(case: Case) -> Decision:
+    return unless({"no shapes but analytic ones": case.facts.native_shapes == 0})
 
 
 @rule("coherent", "coherent packets", "coherent packets of rays")
-def _coherent(case: Case) -> Reasons:  # it pays where there are thousands of triangles to meet
-    return {"no mesh in the scene": case.facts.meshes == 0}
+def _coherent(case: Case) -> Decision:  # it pays where there are thousands of triangles to meet
+    return unless({"no mesh in the scene": case.facts.meshes == 0})
 
 
 def _quadric_content(facts: SceneFacts, plan: KernelPlan) -> str:
@@ -298,90 +283,88 @@ def _quadric_content(facts: SceneFacts, plan: KernelPlan) -> str:
     return f"{count} exact objects in a tree: {', '.join(plan.quadrics)}"
 
 
-def _quadric_kinds(case: Case, free: bool) -> tuple[str, ...]:
-    return tuple(kind for kind, _ in case.facts.quadrics)
-
-
-@rule("quadrics", "cones and cylinders", _quadric_content, _quadric_kinds)
-def _quadrics(case: Case) -> Reasons:
-    return {"none in the scene": not case.facts.quadrics}
+@rule("quadrics", "cones and cylinders", _quadric_content)
+def _quadrics(case: Case) -> Decision:
+    kinds = tuple(kind for kind, _ in case.facts.quadrics)
+    return kinds, {"none in the scene": not kinds}
 
 
 @rule("planes", "planes", "{facts.planes} analytic planes")
-def _planes(case: Case) -> Reasons:
-    return {"none in the scene": case.facts.planes == 0}
+def _planes(case: Case) -> Decision:
+    return unless({"none in the scene": case.facts.planes == 0})
 
 
 @rule("buffers", "light buffers", "light buffers: what may be in the way of each light")
-def _buffers(case: Case) -> Reasons:
+def _buffers(case: Case) -> Decision:
     facts = case.facts
-    return {
-        "no light": case.made["lights"] == "none",
-        SCALAR_VARIANT: not facts.vectorised,
-        f"a light other than {names_in('lights')}, or one with derivatives": not facts.tabled,
-        _OTHERS: facts.native_shapes > 0 and case.made["spheres"] != "table",
-        "few objects": case.objects < LEAST_BUFFERED,
-        "too many lights and objects": case.objects * facts.lights > MOST_PAIRS,
-    }
+    return unless(
+        {
+            "no light": case.made["lights"] == "none",
+            SCALAR_VARIANT: not facts.vectorised,
+            f"a light other than {names_in('lights')}, or one with derivatives": not facts.tabled,
+            _OTHERS: facts.native_shapes > 0 and case.made["spheres"] != "table",
+            "few objects": case.objects < LEAST_BUFFERED,
+            "too many lights and objects": case.objects * facts.lights > MOST_PAIRS,
+        }
+    )
 
 
 @rule("eye", "lists around the eye", "lists around the eye: what its rays may meet")
-def _eye(case: Case) -> Reasons:
-    return {
-        SCALAR_VARIANT: not case.facts.vectorised,
-        "few cones and cylinders": case.quadrics < LEAST_BUFFERED,
-        "too many cones and cylinders": case.quadrics > MOST_SEEN,
-        "the camera is no pinhole": not case.facts.pinhole,
-    }
+def _eye(case: Case) -> Decision:
+    return unless(
+        {
+            SCALAR_VARIANT: not case.facts.vectorised,
+            "few cones and cylinders": case.quadrics < LEAST_BUFFERED,
+            "too many cones and cylinders": case.quadrics > MOST_SEEN,
+            "the camera is no pinhole": not case.facts.pinhole,
+        }
+    )
 
 
 @rule("random", "random numbers", "random numbers")
-def _random(case: Case) -> Reasons:
-    return {"every light is a point or a direction": case.facts.random_lights == 0}
+def _random(case: Case) -> Decision:
+    return unless({"every light is a point or a direction": case.facts.random_lights == 0})
 
 
 @rule("emission", "emission", "emission of surfaces")
-def _emission(case: Case) -> Reasons:
-    return {"no surface emits": case.facts.surface_emitters == 0}
+def _emission(case: Case) -> Decision:
+    return unless({"no surface emits": case.facts.surface_emitters == 0})
 
 
 _SKY: Content = {"parameter": "the integrator's sky", "environment": "the scene's sky"}
 
 
-def _sky_source(case: Case, free: bool = True) -> str:
+@rule("sky", "sky", _SKY)
+def _sky(case: Case) -> Decision:
+    source = "environment" if case.facts.environment else "none"
     if case.own_sky is not None:
-        return "parameter"
-    return "environment" if case.facts.environment else "none"
-
-
-@rule("sky", "sky", _SKY, _sky_source)
-def _sky(case: Case) -> Reasons:
-    return {"no sky in the scene": _sky_source(case) == "none"}
+        source = "parameter"
+    return source, {"no sky in the scene": source == "none"}
 
 
 @rule("textures", "textures", "textures and their coordinates")
-def _textures(case: Case) -> Reasons:
-    return {"every material is uniform": not case.facts.textured}
+def _textures(case: Case) -> Decision:
+    return unless({"every material is uniform": not case.facts.textured})
 
 
 @rule("shading_frames", "shading normals", "shading normals of meshes")
-def _shading_frames(case: Case) -> Reasons:
-    return {"no mesh in the scene": case.facts.meshes == 0}
+def _shading_frames(case: Case) -> Decision:
+    return unless({"no mesh in the scene": case.facts.meshes == 0})
 
 
 @rule("tangents", "tangents", "tangents along texture coordinates")
-def _tangents(case: Case) -> Reasons:
-    return {"no material depends on the direction of texture coordinates": not case.facts.oriented}
+def _tangents(case: Case) -> Decision:
+    return unless({"no material depends on the direction of texture coordinates": not case.facts.oriented})
 
 
 @rule("merged", "merged materials", "all materials as one, from a table")
-def _merged(case: Case) -> Reasons:
-    return {case.facts.unmergeable: bool(case.facts.unmergeable)}
+def _merged(case: Case) -> Decision:
+    return unless({case.facts.unmergeable: bool(case.facts.unmergeable)})
 
 
 @rule("two_sided", "light from behind", "light from behind surfaces")
-def _two_sided(case: Case) -> Reasons:
-    return {"no material is lit from behind": not case.facts.two_sided}
+def _two_sided(case: Case) -> Decision:
+    return unless({"no material is lit from behind": not case.facts.two_sided})
 
 
 #: What a decision is about, by its name
@@ -397,9 +380,9 @@ def make_plan(facts: SceneFacts, tracer: Tracer, own_sky: float | None) -> Kerne
     case = Case(facts, tracer, own_sky)
     reasons = list[tuple[str, str]]()
     for each in RULES:
-        valid = [why for why, holds in each.against(case).items() if holds]
+        case.made[each.name], against = each.decide(case)
+        valid = [why for why, holds in against.items() if holds]
         reasons += [(each.name, why) for why in valid[:1]]
-        case.made[each.name] = each.value(case, not valid)
     return KernelPlan(**case.made, reasons=tuple(reasons))
 
 

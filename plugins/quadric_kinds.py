@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
@@ -252,34 +251,31 @@ def _join(*parts: UnitMesh) -> UnitMesh:
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
-@dataclass(frozen=True)
 class QuadricTable:
-    """Objects of one kind, by their unit frames."""
+    """Objects of one kind, by their unit frames, and the mesh that stands for each."""
 
-    kind: str  # a key of KINDS
-    origins: np.ndarray  # float64 [n, 3]
-    rows: np.ndarray  # float64 [n, 3, 3]
-    first_faces: np.ndarray  # int [n], of the stand-in of each, for textures that are looked up by face
-    flipped: bool = False  # do the normals point inwards
+    def __init__(
+        self,
+        kind: str,
+        numbers: np.ndarray,
+        place: Callable[[Frame], Frame],
+        unit: UnitMesh,
+        *,
+        flipped: bool,
+    ) -> None:
+        """Read the ``numbers`` of the objects, float64 [n, width], and move each by ``place``.
 
-    @classmethod
-    def of_one(cls, kind: str, frame: Frame, *, flipped: bool = False) -> QuadricTable:
-        """Return the table of a shape that is one object."""
-        rows = np.array([[list(frame.x), list(frame.y), list(frame.z)]])
-        return cls(kind, np.array([list(frame.origin)]), rows, np.zeros(1, int), flipped)
-
-    @classmethod
-    def of_numbers(
-        cls, kind: str, numbers: np.ndarray, faces: int, place: Callable[[Frame], Frame], *, flipped: bool
-    ) -> QuadricTable:
-        """Return the table of objects given by ``numbers`` [n, width], moved by ``place``.
-
-        ``faces``: number of those of the stand-in of each.
+        ``unit``: the stand-in in the unit frame. ``flipped``: the normals point inwards.
         """
         points = [Columns.of(numbers[:, 3 * k : 3 * k + 3]) for k in range(KINDS[kind].points)]
         frame = place(KINDS[kind].frame(*points, column(numbers[:, -1])))
-        rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)
-        return cls(kind, frame.origin.array(), rows, faces * np.arange(len(numbers)), flipped)
+        self.kind = kind
+        self.unit = unit
+        self.flipped = flipped
+        self.origins = frame.origin.array()  # float64 [n, 3]
+        self.rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)  # [n, 3, 3]
+        #: the first face of each stand-in, int [n], for textures that are looked up by face
+        self.first_faces = len(unit[1]) * np.arange(len(numbers))
 
     def boxes(self) -> np.ndarray:
         """Return the bounding boxes [n, 2, 3]: of ellipsoids at both ends."""
@@ -305,10 +301,10 @@ class QuadricTable:
         numbers[:, 3, 3] = -1 if self.flipped else 1
         return numbers
 
-    def stand_in(self, unit: UnitMesh) -> dict[str, np.ndarray]:
-        """Return the buffers of a mesh of all objects, each of them ``unit``; frames may be left-handed."""
+    def stand_in(self) -> dict[str, np.ndarray]:
+        """Return the buffers of a mesh of all objects; frames may be left-handed."""
         columns = np.linalg.inv(self.rows).transpose(0, 2, 1)
-        vertices, faces = unit
+        vertices, faces = self.unit
         positions = vertices[:, :3] @ columns + self.origins[:, None]
         normals = vertices[:, 3:6] @ self.rows
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)

@@ -13,10 +13,11 @@ from .intersect import LATERAL, Frame
 from .point_buffer import PointBuffer
 from .quadric_kinds import KINDS
 from .tree import Tree
-from .variants import aligned, is_jit, put_where, shape_ids
+from .variants import Table, is_jit, put_where, shape_at, shape_ids
 
 if TYPE_CHECKING:
-    from .exact_mesh import ExactMesh
+    from .axial import AxialMesh
+    from .group import MrtGroup
 
 
 class Quadrics:
@@ -25,34 +26,31 @@ class Quadrics:
     Scalar variants have no tree: they go through the list.
     """
 
-    def __init__(self, shapes: Sequence[ExactMesh]) -> None:
-        tables = self._tables = [s.quadrics() for s in shapes]
+    def __init__(self, shapes: Sequence[AxialMesh | MrtGroup]) -> None:
+        tables = [s.table for s in shapes]
         counts = [len(t.rows) for t in tables]
         self.count = sum(counts)
         self.kinds = sorted({t.kind for t in tables})  # the kernel holds these only
         self.flipped = any(t.flipped for t in tables)
-        boxes = np.concatenate([t.boxes() for t in tables])
-        numbers = np.concatenate([t.numbers(self.kinds) for t in tables])
-        owners = np.repeat(np.arange(len(shapes)), counts).tolist()
-        faces = np.concatenate([t.first_faces for t in tables])
-        if not is_jit():
-            self.rows = numbers.tolist()
-            self.shapes = [shapes[k] for k in owners]
-            self.faces = faces.tolist()
-            self.moving: list[tuple[int, Frame]] = []
-            return
-        tree = self.tree = Tree(boxes)
-        table = np.zeros((tree.leaves, 4, 4), np.float32)
-        table[tree.leaf_of] = numbers
-        self.table = aligned(table)
-        of_leaves = np.zeros((2, tree.leaves), np.uint32)
-        of_leaves[:, tree.leaf_of] = owners, faces
-        self.shapes = dr.gather(mi.UInt32, shape_ids(shapes), mi.UInt32(of_leaves[0]))
-        self.faces = mi.UInt32(of_leaves[1])
-        dr.eval(self.shapes, self.faces)
-        leaves = tree.leaf_of[np.cumsum([0, *counts[:-1]])].tolist()  # of the first quadric of each shape
+        self._boxes = np.concatenate([t.boxes() for t in tables])
+        self.leaf_of = np.arange(self.count)
+        leaves = self.count
+        if is_jit():
+            self.tree = Tree(self._boxes)
+            self.leaf_of = self.tree.leaf_of
+            leaves = self.tree.leaves
+        numbers = np.zeros((leaves, 4, 4))
+        numbers[self.leaf_of] = np.concatenate([t.numbers(self.kinds) for t in tables])
+        self.numbers = Table(mi.Vector4f, numbers)
+        faces = np.zeros(leaves, int)
+        faces[self.leaf_of] = np.concatenate([t.first_faces for t in tables])
+        self.faces = Table(mi.UInt32, faces)
+        owners = np.zeros(leaves, int)
+        owners[self.leaf_of] = np.repeat(np.arange(len(shapes)), counts)
+        self.shapes = shape_ids([shapes[k] for k in owners])
+        firsts = self.leaf_of[np.cumsum([0, *counts[:-1]])].tolist()  # of the first quadric of each shape
         frames = [s.moving_frame() for s in shapes]
-        self.moving = [(k, f) for k, f in zip(leaves, frames, strict=True) if f is not None]
+        self.moving = [(k, f) for k, f in zip(firsts, frames, strict=True) if f is not None]
 
     def intersect(
         self, ray: mi.Ray3f, active: mi.Bool, eye: PointBuffer | None = None, any_hit: bool = False
@@ -84,18 +82,12 @@ class Quadrics:
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the boxes [n, 2, 3] of the quadrics, and their places in the rows."""
-        return np.concatenate([t.boxes() for t in self._tables]), self.tree.leaf_of
+        return self._boxes, self.leaf_of
 
     def block(self, leaf: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
         """Return whether a quadric is before ``ray.maxt``."""
         t, _ = self._meet(leaf, ray)
         return t < ray.maxt
-
-    def scale(self, leaf: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """Return the size of the coordinates of a quadric: the largest number in its box."""
-        if not is_jit():
-            return self.rows[leaf][3][1]
-        return dr.gather(mi.Float, self.table, 16 * leaf + 13, active)
 
     def put_into(
         self,
@@ -103,14 +95,18 @@ class Quadrics:
         ray: mi.Ray3f,
         hit: tuple[mi.Float, mi.UInt32, mi.Int32],
         where: mi.Bool,
+        scale: mi.Float,
         *,
         tangents: bool = False,
-    ) -> None:
-        """Make ``si`` the interaction of ``ray`` with what ``intersect`` found."""
+    ) -> mi.Float:
+        """Make ``si`` the interaction of ``ray`` with what ``intersect`` found.
+
+        Returns the size of its coordinates, the largest number in the quadric's box; ``scale`` elsewhere.
+        """
         t, leaf, part = hit
         if not (is_jit() or where):
-            return
-        frame, kind, side = self._row(leaf, where)
+            return scale
+        frame, kind, size, side = self._row(leaf, where)
         for number, moving in self.moving:
             rows = zip((moving.origin, moving.x, moving.y, moving.z), vars(frame).values(), strict=True)
             frame = Frame(*(dr.select(leaf == number, mi.Vector3f(a), mi.Vector3f(b)) for a, b in rows))
@@ -120,32 +116,26 @@ class Quadrics:
             p, n, _, _ = self._by_kind(kind, "surface", met, part, frame)
             t = dr.replace_grad(t, t + dr.dot(p - met, n) / dr.dot(ray.d, n))
         p, n, u, v = self._by_kind(kind, "surface", dr.fma(ray.d, t, ray.o), part, frame)
+        more = {}
         if tangents:
             by_u, by_v = self._by_kind(kind, "derivatives", frame.point(p), part)
-            si.dp_du = dr.select(where, frame.to_world(by_u), si.dp_du)
-            si.dp_dv = dr.select(where, frame.to_world(by_v), si.dp_dv)
+            more = {"dp_du": frame.to_world(by_u), "dp_dv": frame.to_world(by_v)}
         if self.flipped:
             n *= side
-        if is_jit():
-            shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.shapes, leaf, where))
-            face = dr.gather(mi.UInt32, self.faces, leaf, where)
-        else:
-            shape = self.shapes[leaf]
-            face = self.faces[leaf]
-        put_where(where, si, t=t, p=p, n=mi.Normal3f(n), uv=mi.Point2f(u, v), shape=shape, prim_index=face)
+        shape = shape_at(self.shapes, leaf, where)
+        more |= {"uv": mi.Point2f(u, v), "shape": shape, "prim_index": self.faces(leaf, where)}
+        put_where(where, si, t=t, p=p, n=mi.Normal3f(n), **more)
+        return dr.select(where, size, scale)
 
-    def _row(self, leaf: mi.UInt32, active: mi.Bool = True) -> tuple[Frame, mi.Float, mi.Float]:
-        """Return frame, kind and side of the normal."""
-        if is_jit():
-            x, y, z, more = (dr.gather(mi.Vector4f, self.table, 4 * leaf + k, active) for k in range(4))
-        else:
-            x, y, z, more = map(mi.Vector4f, self.rows[leaf])
+    def _row(self, leaf: mi.UInt32, active: mi.Bool = True) -> tuple[Frame, mi.Float, mi.Float, mi.Float]:
+        """Return frame, kind, size of the coordinates and side of the normal."""
+        x, y, z, more = (self.numbers(leaf, active, part) for part in range(4))
         rows = (mi.Vector3f(r.x, r.y, r.z) for r in (x, y, z))
-        return Frame(mi.Point3f(x.w, y.w, z.w), *rows), more.x, more.w
+        return Frame(mi.Point3f(x.w, y.w, z.w), *rows), more.x, more.y, more.w
 
     def _meet(self, leaf: mi.UInt32, ray: mi.Ray3f) -> tuple[mi.Float, mi.Int32]:
         """Return distance and part of a quadric; inf where it is not met."""
-        frame, kind, _ = self._row(leaf)
+        frame, kind, _, _ = self._row(leaf)
         t, part = self._by_kind(kind, "intersect", ray.o, ray.d, frame)
         return t, mi.Int32(part)
 

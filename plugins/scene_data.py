@@ -121,8 +121,7 @@ class SceneData:
             nearer = mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths)
             quadric = self.quadrics.intersect(nearer, active, eye)
             closer = active & (quadric[0] < reach)
-            self.quadrics.put_into(si, ray, quadric, closer, tangents=plan.tangents)
-            scale = dr.select(closer, self.quadrics.scale(quadric[1], closer), scale)
+            scale = self.quadrics.put_into(si, ray, quadric, closer, scale, tangents=plan.tangents)
             flat = None if flat is None else dr.select(closer, dr.inf, flat)
             found = found | closer
         if plan.planes:
@@ -203,7 +202,7 @@ def context_of(lobes: Sequence[str]) -> mi.BSDFContext:
 
 def _trace(reading: Reading, plan: KernelPlan) -> tuple:
     """Sort the shapes by who traces them."""
-    exact = [s for s in reading.quadrics if s.quadrics().kind in plan.quadrics]
+    exact = [s for s in reading.quadrics if s.table.kind in plan.quadrics]
     planes = reading.planes if plan.planes else []
     own = {id(s) for s in (*exact, *planes)}
     others = [s for s in reading.snapshot.shapes if id(s) not in own]

@@ -11,7 +11,7 @@ import numpy as np
 
 from .intersect import intersect_plane
 from .snapshot import parameters_of
-from .variants import ByShape, Table, first, put_where
+from .variants import ByShape, Table, first, put_where, shape_at, shape_ids
 
 if TYPE_CHECKING:
     from .plane import MrtPlane
@@ -29,7 +29,7 @@ class Planes:
         # The same kernel serves every plane of every scene: its numbers are data
         dr.make_opaque(self.equations)
         self.tangents = [Table(mi.Vector3f, [s.tangents[k] for s in shapes]) for k in range(2)]
-        self.shapes = Table("Shape", shapes)
+        self.shapes = shape_ids(shapes)
 
     def intersect(self, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32, mi.Bool]:
         """Return the distance of the nearest plane, or ``ray.maxt``, its number, and if there is one."""
@@ -75,12 +75,10 @@ class Planes:
         # Along a grazing ray the error of t is far larger than that of the plane
         p -= n * _height(p, n, distance)
         along = [tangent(index, where) for tangent in self.tangents]
-        if tangents:
-            pairs = zip(along, (si.dp_du, si.dp_dv), strict=True)
-            si.dp_du, si.dp_dv = (dr.select(where, *pair) for pair in pairs)
+        more = {"dp_du": along[0], "dp_dv": along[1]} if tangents else {}
         uv = mi.Point2f(*(dr.dot(tangent, p) for tangent in along))
-        shape = self.shapes(index, where)
-        put_where(where, si, t=ray.maxt, p=p, n=mi.Normal3f(n), uv=uv, shape=shape)
+        shape = shape_at(self.shapes, index, where)
+        put_where(where, si, t=ray.maxt, p=p, n=mi.Normal3f(n), uv=uv, shape=shape, **more)
         return dr.select(where, dr.abs(distance), scale)
 
 

@@ -108,59 +108,66 @@ def aligned(values: np.ndarray, kind: type = np.float32) -> mi.Float:
     return mi.Float(place) if kind is np.float32 else mi.UInt32(place)
 
 
-def shape_ids(shapes: Sequence[mi.Shape]) -> mi.UInt32:
-    """Return Dr.Jit's numbers of shapes.
+def shape_ids(shapes: Sequence[mi.Shape]) -> mi.UInt32 | Sequence[mi.Shape]:
+    """Return Dr.Jit's numbers of shapes for ``shape_at``; in scalar variants, the shapes.
 
-    Of pointers that a recorded kernel reads, it would look at all objects of all scenes at each launch.
+    If a recorded kernel reads pointers instead, Dr.Jit looks at all objects of all scenes at each launch.
     """
-    return dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes))
+    if not is_jit():
+        return shapes
+    ids = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes))
+    dr.eval(ids)
+    return ids
+
+
+def shape_at(ids: mi.UInt32 | Sequence[mi.Shape], index: mi.UInt32, active: mi.Bool) -> mi.ShapePtr:
+    """Return one of the shapes that were given to ``shape_ids``, by index."""
+    if not is_jit():
+        return ids[index]
+    return dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, ids, index, active))
 
 
 class Table:
-    """Rows of numbers, or shapes (``kind`` "Shape"), looked up by index."""
+    """Numbers of a type of Mitsuba's, [n], [n, width] or [n, parts, width], looked up by index and part."""
 
-    def __init__(self, kind: Any, rows: Any) -> None:
+    def __init__(self, kind: type, numbers: Sequence | np.ndarray) -> None:
+        rows = np.array(numbers)
         self.kind = kind
-        self.rows = rows
-        if not is_jit():
-            self.rows = rows if kind == "Shape" else [kind([float(x) for x in row]) for row in rows]
+        self.parts = rows.shape[1] if rows.ndim == 3 else 1
+        self.rows: Any
+        if is_jit():
+            self.rows = aligned(rows, np.uint32 if kind is mi.UInt32 else np.float32)
         else:
-            self.rows = shape_ids(rows) if kind == "Shape" else aligned(np.array(rows))
-        dr.eval(self.rows)
+            width = rows.shape[-1] if rows.ndim > 1 else 1
+            self.rows = [kind(*row) for row in rows.reshape(-1, width).tolist()]
 
-    def __call__(self, index: mi.UInt32, active: mi.Bool) -> Any:
+    def __call__(self, index: mi.UInt32, active: mi.Bool, part: int = 0) -> Any:
+        place = index * self.parts + part
         if not is_jit():
-            return self.rows[index if active else 0]
-        if self.kind == "Shape":
-            return dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.rows, index, active))
-        return dr.gather(self.kind, self.rows, index, active)
+            return self.rows[place if active else 0]
+        return dr.gather(self.kind, self.rows, place, active)
 
 
 class ByShape:
     """Numbers for each of some shapes, looked up for the one that was hit; ``fallback`` for others.
 
-    In vectorised variants, a row may have several parts of a kind's width.
+    In vectorised variants, they may have parts, as in a ``Table``.
     """
 
     def __init__(
         self, kind: type, shapes: Sequence[mi.Shape], rows: Sequence, fallback: float | list[float]
     ) -> None:
-        self.kind = kind
         self.fallback = kind(fallback)
         if not is_jit():
             self.shapes = shapes  # alive, or their ids could pass to others
             self.rows = {id(s): kind(row) for s, row in zip(shapes, rows, strict=True)}
             return
         ids = np.array(shape_ids(shapes))
-        size = int(ids.max()) + 1
-        width = 1 if kind is mi.Float else dr.size_v(kind)
-        numbers = np.reshape(rows, (len(shapes), -1, width))
-        self.parts = numbers.shape[1]
-        table = np.empty((size, self.parts, width), np.float32)
-        table[:] = fallback
-        table[ids] = numbers
-        self.table = aligned(table)
-        self.size = dr.opaque(mi.UInt32, size)
+        numbers = np.empty((ids.max() + 1, *np.shape(rows)[1:]), np.float32)
+        numbers[:] = fallback
+        numbers[ids] = rows
+        self.table = Table(kind, numbers)
+        self.size = dr.opaque(mi.UInt32, len(numbers))
         dr.make_opaque(self.fallback)
 
     def __call__(self, si: mi.SurfaceInteraction3f, active: mi.Bool, part: int = 0) -> Any:
@@ -168,5 +175,4 @@ class ByShape:
             return self.rows.get(id(si.shape), self.fallback) if active else self.fallback
         ids = dr.reinterpret_array(mi.UInt32, si.shape)
         known = active & (ids < self.size)
-        index = ids * self.parts + part
-        return dr.select(known, dr.gather(self.kind, self.table, index, known), self.fallback)
+        return dr.select(known, self.table(ids, known, part), self.fallback)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import signal
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
@@ -289,49 +290,48 @@ class MrtWhitted(mi.SamplingIntegrator):
         if emitter is not None:  # as it is of most surfaces in scalar variants
             radiance += mi.unpolarized_spectrum(emitter.eval(si, hit.found))
 
-        def sampled(light: Any, sampler: mi.Sampler) -> tuple:
-            """Return direction to a light, locally too, what may arrive from it, and if on the lit side."""
-            u = sampler.next_2d(hit.found) if plan.random else mi.Point2f(0.5)
-            ds, arriving = data.lights.sample(light, si, u, hit.found)
-            wo = si.to_local(ds.d)
-            facing = hit.found & (ds.pdf > 0)
-            if not plan.two_sided:
-                facing &= mi.Frame3f.cos_theta(wo) > 0
-            return ds, wo, mi.unpolarized_spectrum(arriving), facing
+        def add(
+            lights: Sequence[Any], radiance: Any, shadow_rays: Any, sampler: mi.Sampler, mirror: bool
+        ) -> tuple:
+            """Add what some lights contribute, and the shadow rays traced for them; return the sums, and the
+            mirror reflectance and its index of refraction, evaluated in the same call."""
+            samples = []
+            wos = []
+            facing = []  # is the light on the lit side
+            for light in lights:
+                u = sampler.next_2d(hit.found) if plan.random else mi.Point2f(0.5)
+                ds, arriving = data.lights.sample(light, si, u, hit.found)
+                samples.append((light, ds, mi.unpolarized_spectrum(arriving)))
+                wos.append(si.to_local(ds.d))
+                facing.append(hit.found & (ds.pdf > 0))
+                if not plan.two_sided:
+                    facing[-1] &= mi.Frame3f.cos_theta(wos[-1]) > 0
+            bsdf_values, *of_mirror = data.eval_bsdf(hit, wos, facing, mirror)
+            for (light, ds, arriving), lit, bsdf_value in zip(samples, facing, bsdf_values, strict=True):
+                value = arriving * bsdf_value
+                if self.clamp:
+                    value = dr.clip(value, 0, 1)
+                share = dr.max(dr.abs(throughput * value))
+                traced = lit & (share * plan.cut_off[1] > self.min_contribution)
+                visible = but_not(lit, data.occluded(scene, hit, light, ds, traced))
+                radiance = radiance + dr.select(visible, value, 0)
+                shadow_rays = shadow_rays + dr.select(traced, mi.UInt32(1), mi.UInt32(0))
+            return radiance, shadow_rays, *of_mirror
 
-        def lit(light: Any, sample: tuple, bsdf_value: mi.UnpolarizedSpectrum) -> tuple:
-            """Return a light's contribution where nothing blocks it, and the shadow rays traced for it."""
-            ds, _, arriving, facing = sample
-            value = arriving * bsdf_value
-            if self.clamp:
-                value = dr.clip(value, 0, 1)
-            share = dr.max(dr.abs(throughput * value))
-            traced = facing & (share * plan.cut_off[1] > self.min_contribution)
-            visible = but_not(facing, data.occluded(scene, hit, light, ds, traced))
-            value = dr.select(visible, value, 0)
-            return value, dr.select(traced, mi.UInt32(1), mi.UInt32(0))
-
-        samples = [sampled(light, sampler) for light in range(data.lights.unrolled)]
-        values, reflectance, int_ior = data.eval_bsdf(
-            hit, [wo for _, wo, _, _ in samples], [facing for *_, facing in samples], plan.mirrors
-        )
-        for light, (sample, value) in enumerate(zip(samples, values, strict=True)):
-            light_here, traced = lit(light, sample, value)
-            radiance = radiance + light_here
-            shadow_rays = shadow_rays + traced
-
-        def step(light: mi.UInt32, radiance: Any, shadow_rays: Any, sampler: mi.Sampler) -> tuple:
-            sample = sampled(light, sampler)
-            (value,), _, _ = data.eval_bsdf(hit, [sample[1]], [sample[3]], mirror=False)
-            light_here, traced = lit(light, sample, value)
-            return light + 1, radiance + light_here, shadow_rays + traced, sampler
+        def add_next(light: mi.UInt32, radiance: Any, shadow_rays: Any, sampler: mi.Sampler) -> tuple:
+            radiance, shadow_rays, *_ = add([light], radiance, shadow_rays, sampler, mirror=False)
+            return light + 1, radiance, shadow_rays, sampler
 
         def is_left(light: mi.UInt32, *_: object) -> mi.Bool:
             return hit.found & (light < data.lights.count)
 
+        unrolled = range(data.lights.unrolled)
+        radiance, shadow_rays, reflectance, int_ior = add(
+            unrolled, radiance, shadow_rays, sampler, plan.mirrors
+        )
         if plan.lights in ("loop", "table"):
             state = mi.UInt32(0), radiance, shadow_rays, sampler if plan.random else None
-            _, radiance, shadow_rays, sampler = dr.while_loop(state, is_left, step, label="lights")
+            _, radiance, shadow_rays, sampler = dr.while_loop(state, is_left, add_next, label="lights")
         cost = mi.UInt32(1)
         if self.bounce_budget == "report":
             tenths = mi.Int32(dr.minimum(10 * int_ior, 10))
