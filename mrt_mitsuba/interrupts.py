@@ -89,7 +89,7 @@ def heed(handlers: dict[int, Callable[..., Any]] = _handlers) -> None:
 
 
 def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
-    """Return the interrupt that an error was made of by Mitsuba or Dr.Jit, None where there was none."""
+    """The interrupt that Mitsuba or Dr.Jit turned into an error; None for any other error."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__

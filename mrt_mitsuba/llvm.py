@@ -102,10 +102,11 @@ def wheel_library(search_path: Iterable[str]) -> tuple[str, str]:
         for path in filter(os.path.isfile, (os.path.normpath(f"{info}/../{file}") for file in files)):
             # Python makes symbolic links at its next start; without them, libraries it needs are missing
             unfinished = os.path.exists(f"{info}/symlinks.txt") and not os.path.exists(f"{info}/axle.done")
-            return path, unfinished * (
+            problem = (
                 f"the installation of {WHEEL} is unfinished: whoever may write to {info} has to start Python "
                 f"once ({sys.executable} -c '')"
             )
+            return path, problem if unfinished else ""
     return "", ""
 
 

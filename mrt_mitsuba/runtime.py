@@ -92,7 +92,7 @@ def register(guard: bool = True) -> None:
 
 
 def default_variant() -> str:
-    """Return ``llvm_ad_rgb`` if LLVM works here, else ``scalar_rgb`` with one warning per process."""
+    """``llvm_ad_rgb`` if LLVM works here, else ``scalar_rgb`` with one warning per process."""
     problem = obstacle(FAST)
     if problem:
         _warn_once(f"rendering in the slow variant {SLOW}: {problem}")
@@ -100,7 +100,7 @@ def default_variant() -> str:
 
 
 def obstacle(variant: str) -> str | None:
-    """Return the reason that keeps a known variant from running here, with the fix, or None."""
+    """The reason that keeps a known variant from running here, with the fix, or None."""
     if variant.startswith("llvm"):
         return llvm.problem(llvm.prepare())
     if not variant.startswith("cuda"):
@@ -125,13 +125,13 @@ def _warn_once(text: str) -> None:
 
 
 def usable_variants() -> list[str]:
-    """Return the variants of this Mitsuba that can run here."""
+    """The variants of this Mitsuba that can run here."""
     return [variant for variant in mi.variants() if obstacle(variant) is None]
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Return the versions of what decides about pixels."""
+    """The versions of all that decides about pixels, by name."""
     from mrt_mitsuba import __version__
 
     version = llvm.prepare().version

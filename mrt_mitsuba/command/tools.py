@@ -17,7 +17,6 @@ from mrt_mitsuba.command.registry import COMMANDS
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError
 from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.scene.files import require_file
-from mrt_mitsuba.scene.model import MODEL_OPTIONS
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
 if sys.version_info >= (3, 11):
@@ -118,19 +117,16 @@ def export(place: str, /, *, xml: str, stock: str = "", **given: str) -> int:
     """Write a scene, a number or the path of a file, as XML."""
     scene_word = place if place.isdecimal() else f"scene={place}"
     options = parse(["export", scene_word, *(f"{name}={text}" for name, text in given.items())])
-    known = {"width", "height", "fresnel", *MODEL_OPTIONS, *(options.params or ())}
-    if options.error is not None:
-        known.discard("target")  # an error, and not what the camera looks at
-    strange = given.keys() - known
-    if strange:  # what is said of the render, which is not in the file
+    kept = {name: getattr(options, name) for name in ("width", "height", "fresnel", "params")}
+    kept |= options.model()
+    strange = given.keys() - kept.keys() - (options.params or {}).keys()
+    if strange:  # about the render, which is not in the file
         raise UsageError(
             f"{min(strange)} is of no use to mrt export. Usage: mrt export {COMMANDS['export'].form}"
         )
     from mrt_mitsuba.scene.export import write_xml
 
     check_target(xml, options.inputs())
-    kept = {name: getattr(options, name) for name in ("width", "height", "fresnel", "params")}
-    kept |= options.model()
     paths = write_xml(options.scene, xml, flavor="stock" if stock else "mrt", **kept)
     print(f"Wrote {' and '.join(paths)}")
     return 0

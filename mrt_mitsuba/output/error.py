@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 # Above this Pareto shape, a variance is unknown: rays not met yet may rule it (A. Vehtari and others, 2024)
 DOUBTFUL = 0.7
-FEWEST, MANY = 20, 25  # values that tell a shape; those that are many to share half of the squares
+FEWEST = 20  # values that show a shape
+MANY = 25  # values that are many to share half of the squares
 
 
 @dataclass(frozen=True)
@@ -53,18 +54,18 @@ class RoundPicture(Round):
 
 
 def tail_shape(values: np.ndarray, counts: np.ndarray) -> float:
-    """Return the Pareto shape k of the largest of some values, each there so many times.
+    """The Pareto shape k of the largest of some values [N], positive, each there as often as ``counts`` says.
 
     The largest are twice as many as make up half of the squares, or as many as A. Vehtari and others take
     ("Pareto smoothed importance sampling", 2024), if that is less: of more, most would not matter. Shapes
     above 1/2 leave half of the squares to a few; where it takes many, a mixture looks like such a tail.
     """
-    count, total = int(counts.sum()), float((counts * values**2).sum())
-    size = max(int(min(0.2 * count, 3 * math.sqrt(count))), 1)
+    size = max(_of_tail(int(counts.sum())), 1)
     order = np.argpartition(-values, min(size, len(values) - 1))[: size + 1]
     order = order[np.argsort(-values[order])]
     largest = np.repeat(values[order], counts[order].astype(np.int64))[: size + 1]
-    half = int(np.searchsorted(np.cumsum(np.square(largest)), total / 2)) + 1
+    half_of_all = float((counts * values**2).sum()) / 2
+    half = int(np.searchsorted(np.cumsum(np.square(largest)), half_of_all)) + 1
     size = min(max(2 * half, FEWEST), len(largest) - 1)
     if size < FEWEST or largest[0] <= largest[size]:
         return 0.0
@@ -73,13 +74,13 @@ def tail_shape(values: np.ndarray, counts: np.ndarray) -> float:
 
 
 def exceedance(values: np.ndarray) -> float:
-    """Return the probability that the largest of some values is as far above the others as it is.
+    """The probability that the largest of some values is as far above the others as it is.
 
     Over a threshold, a Pareto law that all but the largest decide makes their squares exponential, and gaps
     between ordered exponential values, each times its rank, are independent and alike (A. Rényi, 1953).
     """
     ordered = np.sort(np.square(values[values > 0]), axis=None)[::-1]
-    size = int(min(0.2 * ordered.size, 3 * math.sqrt(ordered.size)))
+    size = _of_tail(ordered.size)
     if size < FEWEST or ordered[0] == ordered[size]:
         return 1.0
     excess = ordered[:size] - ordered[size]
@@ -90,8 +91,13 @@ def exceedance(values: np.ndarray) -> float:
     return float((1 + gaps[0] / gaps[1:].sum()) ** (1 - size))
 
 
+def _of_tail(count: int) -> int:
+    """The number of values that A. Vehtari and others take for the tail of so many."""
+    return int(min(0.2 * count, 3 * math.sqrt(count)))
+
+
 def _pareto(excess: np.ndarray, usual: float = 0.5) -> tuple[float, float]:
-    """Return shape and scale of a generalised Pareto distribution, given what exceeds a threshold.
+    """Shape and scale of a generalised Pareto distribution, from the sorted excesses [N] over a threshold.
 
     The fit of J. Zhang and M. Stephens (Technometrics 2009), drawn to the usual shape as by ten values.
     """

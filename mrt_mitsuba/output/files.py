@@ -237,10 +237,10 @@ def png(image: Image) -> bytes:
     """A linear picture [H, W, 3] as a PNG file, in sRGB as screens expect it."""
     import io
 
-    from PIL import Image as Picture
+    from PIL import Image as PilImage
 
     buffer = io.BytesIO()
-    Picture.fromarray(to_8bit(image, "srgb")).save(buffer, format="PNG")
+    PilImage.fromarray(to_8bit(image, "srgb")).save(buffer, format="PNG")
     return buffer.getvalue()
 
 

@@ -32,7 +32,7 @@ from mrt_mitsuba.options import (
 )
 from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.scene.model import FRESNEL, MODEL_OPTIONS, SIDE, SIZE
+from mrt_mitsuba.scene.model import CONVENTION, FRESNEL, MODEL_OPTIONS, SIDE, SIZE
 from mrt_mitsuba.target import Goal, Target
 
 if TYPE_CHECKING:
@@ -106,12 +106,10 @@ class RenderSettings:
     motionmode: str = option(
         "frames", choice("frames", "stratified"), "motion blur: a render for each moment, or one for all"
     )
-    convention: str = option(
-        "report", choice("report", "standard"), "MTL files: Ni is the roughness, or the IOR"
-    )
+    convention: str = option("report", CONVENTION, "MTL files: Ni is the roughness, or the IOR")
     texturing: str | None = option(
         None,
-        choice("report", "standard"),
+        CONVENTION,
         "textures of an OBJ file: nearest texel, or bilinear from sRGB",
         "as convention",
     )

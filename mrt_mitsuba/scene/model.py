@@ -29,6 +29,7 @@ BLUE_SKY: Color = (0.2, 0.2, 0.7)
 SIZE = (800, 600)  # of the picture, in pixels, where the scene brings no film
 SIDE = integer(1, 65536)  # of a picture, in pixels; whether the memory suffices is checked later
 FRESNEL = choice("schlick", "dielectric")
+CONVENTION = choice("report", "standard")  # of MTL files, and of how textures are looked up
 LARGEST = 3.4e38  # number that Mitsuba's float32 can hold
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
 # What is of use only with an OBJ file

@@ -19,10 +19,10 @@ from typing import Any, NoReturn
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.options import StrPath
+from mrt_mitsuba.options import StrPath, check
 from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
-from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Color, Light, Material, Mesh, Scene, Vector
-from mrt_mitsuba.scene.mtl import CONVENTIONS, DEFAULT_MATERIAL, read_mtl
+from mrt_mitsuba.scene.model import BLUE_SKY, CONVENTION, Camera, Color, Light, Material, Mesh, Scene, Vector
+from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, read_mtl
 
 # Numbers of each kind of values that are used: positions may have a weight, a colour or both behind them
 _USED = {"v": 3, "vt": 2, "vn": 3}
@@ -85,8 +85,7 @@ def read_obj(path: StrPath, *, convention: str = "report") -> tuple[tuple[Mesh, 
     Raises ``SceneError`` with file and line for what cannot be read, ``UsageError`` for an unknown
     convention.
     """
-    if convention not in CONVENTIONS:
-        raise UsageError(f"convention={convention!r}: must be {' or '.join(CONVENTIONS)}")
+    check("convention", CONVENTION, convention)
     reader = _Reader(Path(path), convention)
     for block in _BLOCKS.finditer(read_text(reader.path)):
         reader.read(block)

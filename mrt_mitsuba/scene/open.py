@@ -88,9 +88,8 @@ def open_scene(
         name, loaded, values = _loaded(scene, budget, declared)
         if keys and loaded is scene:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
-        distance = _number(values, "focaldist")
-        declared_reach = _number(values, "focalrange")
-        reach = FOCAL_RANGE if declared_reach is None else declared_reach
+        distance = _number(values, "focaldist", None)
+        reach = _number(values, "focalrange", FOCAL_RANGE)
     set_parameters(loaded, keys)
     source = opened(name, loaded, _sensor(name, loaded, sensor), _integrator(integrator, loaded))
     return replace(
@@ -178,12 +177,12 @@ def _check_variant(name: str, thing: object) -> None:
         )
 
 
-def _number(values: Mapping[str, str], name: str) -> float | None:
+def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
     """A number that an XML file declares, as ``write_xml`` writes it."""
     try:
         return max(0.0, float(values[name]))
     except (KeyError, ValueError):
-        return None
+        return default
 
 
 def _sensor(name: str, scene: mi.Scene, number: int) -> mi.Sensor:

@@ -278,13 +278,13 @@ def _meshes(model: str) -> tuple[Mesh, ...]:
     return meshes
 
 
-def c_rand(seed: int = 1) -> Iterator[int]:
-    """Yield the numbers of the GNU C library's ``rand()``: an additive feedback generator over 31 words.
+def c_rand() -> Iterator[int]:
+    """Yield the numbers of the GNU C library's ``rand()`` from the seed 1: an additive feedback generator.
 
     Source: the polynomial x³¹ + x³ + 1 of its manual page, started by a Lehmer generator (multiplier 16807),
     without the first 310 numbers.
     """
-    words = [seed]
+    words = [1]
     for _ in range(30):
         words.append(16807 * words[-1] % 0x7FFFFFFF)
     words += words[:3]

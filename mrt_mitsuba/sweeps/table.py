@@ -18,7 +18,6 @@ from mrt_mitsuba.sweeps.jobs import word
 
 FACTS = {"file": str, "error": str, "seconds": float, "rays": int, "rmse": float, "attempts": int}
 FACTS |= {"worker": str, "versions": str, "checksum": str}
-BEFORE_CHECKSUMS = list(FACTS)[:-1]  # as earlier versions wrote them; pictures without one are made anew
 PAUSE = 1.0  # seconds from one writing to the next, so that short jobs do not rewrite it all the time
 
 
@@ -85,16 +84,15 @@ def _cell(value: object) -> str | float | None:
 
 def _read(path: str) -> dict[str, Facts]:
     """The facts of an earlier table by the name of the file."""
+    facts: dict[str, Facts] = {}
     if not os.path.exists(path):
-        return {}
+        return facts
     with suppress(OSError, ValueError, csv.Error), open(path, encoding="utf-8", newline="") as file:
-        head, *rows = (row for row in csv.reader(file) if row)
-        for names in ([*FACTS], BEFORE_CHECKSUMS):
-            if head[-len(names) :] == names:
-                facts: dict[str, Facts] = {}
-                for row in rows:  # its last columns have these names
-                    texts = dict(zip(names, row[-len(names) :], strict=True))
-                    known = {name: FACTS[name](text) for name, text in texts.items() if text}
-                    facts[texts["file"]] = {"file": ""} | known
-                return facts
+        head, *rows = (row[-len(FACTS) :] for row in csv.reader(file) if row)  # after the values of axes
+        if head == [*FACTS]:
+            for row in rows:
+                texts = zip(FACTS, row, strict=True)
+                known = {name: FACTS[name](text) for name, text in texts if text}
+                facts[known.get("file", "")] = {"file": ""} | known
+            return facts
     raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")
