@@ -246,56 +246,62 @@ class TwoThreads:
 two_threads = TwoThreads()
 
 
-_LOADING = {
-    "what": "loads scenes with plugins of this project one object at a time, unless parallel= is given",
-    "why": "Mitsuba's parallel loader overflows the stack, or crashes, with hundreds of objects in Python",
-}
-
-
-@change("mi.load_dict", **_LOADING)
-def load_dict_in_turn(load: Function, /, *args: object, **given: object) -> object:
-    waiting = [_argument(0, "dict", args, given)]
+def dict_is_ours(scene: object) -> bool:
+    """Whether a dict has a plugin of ours."""
+    waiting = [scene]
     seen = set[int]()  # a dict may lie in itself
-    ours = False
-    while waiting and not ours:
+    while waiting:
         node = waiting.pop()
         if isinstance(node, dict) and id(node) not in seen:
             seen.add(id(node))
-            ours = str(node.get("type", "")).startswith("mrt_")
+            if str(node.get("type", "")).startswith("mrt_"):
+                return True
             waiting += node.values()
-    return _load(load, ours, "dict", *args, **given)
+    return False
 
 
-@change("mi.load_string", **_LOADING)
-def load_string_in_turn(load: Function, /, *args: object, **given: object) -> object:
-    text = _argument(0, "value", args, given)
-    ours = isinstance(text, str) and any(hint.decode() in text for hint in HINTS)
-    return _load(load, ours, "value", *args, **given)
+def text_is_ours(text: object) -> bool:
+    """Whether XML may have a plugin of ours."""
+    return isinstance(text, str) and any(hint.decode() in text for hint in HINTS)
 
 
-@change("mi.load_file", **_LOADING)
-def load_file_in_turn(load: Function, /, *args: object, **given: object) -> object:
-    ours = False
+def file_is_ours(path: Any) -> bool:
+    """Whether an XML file may have a plugin of ours."""
     # Mitsuba itself reports what cannot be read. What is no file, such as a pipe, can be read only once
     with contextlib.suppress(OSError, ValueError, TypeError):
-        name = str(mi.file_resolver().resolve(os.fspath(_argument(0, "path", args, given))))
+        name = str(mi.file_resolver().resolve(os.fspath(path)))
         state = os.stat(name)
-        ours = not stat.S_ISREG(state.st_mode) or state.st_size > LARGEST_SEARCHED
-        if not ours:
-            with open(name, "rb") as file:
-                text = file.read(state.st_size)
-            ours = any(hint in text for hint in HINTS)
-    return _load(load, ours, "path", *args, **given)
+        if not stat.S_ISREG(state.st_mode) or state.st_size > LARGEST_SEARCHED:
+            return True
+        with open(name, "rb") as file:
+            text = file.read(state.st_size)
+        return any(hint in text for hint in HINTS)
+    return False
 
 
-def _load(load: Function, ours: bool, source: str, /, *args: object, **given: object) -> object:
-    """Load a scene; ``ours``: may it have a plugin of ours; ``source``: name of the first parameter."""
-    values = [value for name, value in given.items() if name not in (source, "parallel", "optimize")]
-    free = len(args) < 2 and "parallel" not in given
-    if free and (ours or any("mrt_" in str(value) for value in values)):
-        given["parallel"] = False
-    with two_threads:
-        return load(*args, **given)
+def _loading(where: str, source: str, is_ours: Callable[[Any], bool]) -> Change:
+    """The change of a loader, whose first parameter is ``source``."""
+
+    def load_in_turn(load: Function, /, *args: object, **given: object) -> object:
+        if len(args) < 2 and "parallel" not in given:
+            values = [value for name, value in given.items() if name not in (source, "optimize")]
+            parameters_are_ours = any("mrt_" in str(value) for value in values)
+            if parameters_are_ours or is_ours(_argument(0, source, args, given)):
+                given["parallel"] = False
+        with two_threads:
+            return load(*args, **given)
+
+    return Change(
+        where,
+        load_in_turn,
+        what="loads scenes with plugins of this project one object at a time, unless parallel= is given",
+        why="Mitsuba's parallel loader overflows the stack, or crashes, with hundreds of objects in Python",
+    )
+
+
+CHANGES.append(_loading("mi.load_dict", "dict", dict_is_ours))
+CHANGES.append(_loading("mi.load_string", "value", text_is_ours))
+CHANGES.append(_loading("mi.load_file", "path", file_is_ours))
 
 
 # -------------------------------------------- Light tracing --------------------------------------------

@@ -179,9 +179,13 @@ def either(names: Sequence[str]) -> str:
     return " or ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
 
 
-def option(default: Any, kind: Kind, text: str = "", shown: str | None = None) -> Any:
-    """Declare a field of a table of options; ``shown`` is the default as the help names it."""
-    return dataclasses.field(default=default, metadata={"kind": kind, "help": text, "shown": shown})
+def option(default: Any, kind: Kind, text: str = "", shown: str | None = None, needs: str = "") -> Any:
+    """Declare a field of a table of options.
+
+    ``shown`` is the default as the help names it; ``needs`` another option, without which it is of no use.
+    """
+    metadata = {"kind": kind, "help": text, "shown": shown, "needs": needs}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def table(kind: Any) -> dict[str, dataclasses.Field[Any]]:

@@ -81,10 +81,13 @@ def parse(arguments: Sequence[str]) -> Options:
                 f"SCENE {text}: must be {numbers} ('mrt scenes' lists them); a file is scene=PATH"
             )
         values["scene"] = int(text)
-    if "motion" not in given and (idle := given.keys() & {"motionsamples", "motionmode"}):
-        raise UsageError(f"{min(idle)} is of use only with motion=dx,dy,dz")
     params = {name: given.pop(name) for name in [*given] if name not in TABLE}
-    values |= {n: check(n, TABLE[n].metadata["kind"], text, text=True) for n, text in given.items()}
+    for name, text in given.items():
+        needed = TABLE[name].metadata["needs"]
+        if needed and needed not in given:
+            form = TABLE[needed].metadata["kind"].form
+            raise UsageError(f"{name} is of use only with {needed}={form.lower()}")
+        values[name] = check(name, TABLE[name].metadata["kind"], text, text=True)
     if params:
         from mrt_mitsuba.scene.files import declared
 

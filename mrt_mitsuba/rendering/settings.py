@@ -102,9 +102,14 @@ class RenderSettings:
     motion: Sequence[float] | None = option(
         None, VECTOR._replace(form="DX,DY,DZ"), "motion blur: how far the camera moves", "none"
     )
-    motionsamples: int = option(16, integer(1, 65536), "moments at which motion blur sees the scene")
+    motionsamples: int = option(
+        16, integer(1, 65536), "moments at which motion blur sees the scene", needs="motion"
+    )
     motionmode: str = option(
-        "frames", choice("frames", "stratified"), "motion blur: a render for each moment, or one for all"
+        "frames",
+        choice("frames", "stratified"),
+        "motion blur: a render for each moment, or one for all",
+        needs="motion",
     )
     convention: str = option("report", CONVENTION, "MTL files: Ni is the roughness, or the IOR")
     texturing: str | None = option(
