@@ -218,17 +218,12 @@ def parameters(case: Case) -> Iterator[tuple[str, mi.Float]]:
                 yield key, value
 
 
-def affine(factor: float, summand: float, old: mi.Float) -> mi.Float:
-    """A parameter times one number, plus another."""
-    return type(old)(old * factor + summand)
-
-
 @contextmanager
-def changed(case: Case, key: str, change: Callable[[mi.Float], mi.Float]) -> Iterator[None]:
-    """Change a parameter for a while."""
+def changed(case: Case, key: str, *, factor: float = 1, summand: mi.Float = 0) -> Iterator[None]:
+    """Change a parameter for a while: multiply it by one number, and add another."""
     params = mi.traverse(case.plugin)
     before = type(params[key])(params[key])  # else it changes with the BSDF
-    params.update({key: change(before)})
+    params.update({key: type(before)(before * factor + summand)})
     try:
         yield
     finally:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.bsdf_case import Case, affine, changed, live, narrow, parameters
+from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, live, narrow, parameters
 from mrt_mitsuba.validation.checks.faults import GLOSS, of_weight
 from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, figures, finds, most, number_of
 from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
@@ -112,7 +111,7 @@ def gradients(law: Law, case: Case) -> None:
         number = float(np.mean(np.array(params[key])))
         factor = 0.9 if number == 1 else 1  # so that it can be varied both ways
         summand = 0.1 if number == 0 else 0
-        with changed(case, key, partial(affine, factor, summand)):
+        with changed(case, key, factor=factor, summand=summand):
             if _attached(law, case, key):
                 _sampled(law, case, key)
 
@@ -148,7 +147,7 @@ def _derivatives(
     """Derivatives [K, N] by a parameter of K arrays that ``values`` makes, and whether there are any."""
     shift = mi.Float(0)
     dr.enable_grad(shift)
-    with changed(case, key, lambda old: _moved(old, shift)):
+    with changed(case, key, summand=_sizes(case, key) * shift):
         arrays = values()
         attached = any(map(dr.grad_enabled, arrays))
         if attached:
@@ -220,11 +219,11 @@ def _reached(law: Law, case: Case, key: str) -> None:
     law.hold("reached", off, few.having(value=value), key=key, number=number)
 
 
-def _moved(old: mi.Float, shift: mi.Float) -> mi.Float:
-    """A parameter with ``shift`` of each number added: a spectrum's may be of many sizes."""
-    usual = float(np.mean(abs(np.array(old)))) or 0.05
-    size = dr.select(old == 0, usual, dr.abs(dr.detach(old)))
-    return type(old)(old + size * shift)
+def _sizes(case: Case, key: str) -> mi.Float:
+    """The sizes of the numbers of a parameter: a spectrum's may be of many."""
+    numbers = mi.traverse(case.plugin)[key]
+    usual = float(np.mean(abs(np.array(numbers)))) or 0.05
+    return dr.select(numbers == 0, usual, dr.abs(dr.detach(numbers)))
 
 
 def _values(case: Case) -> mi.Float:
@@ -245,7 +244,7 @@ def _differences(case: Case, key: str) -> tuple[Array, Array]:
     """
 
     def at(shift: float) -> Array:
-        with changed(case, key, lambda old: _moved(old, dr.opaque(mi.Float, shift))):
+        with changed(case, key, summand=_sizes(case, key) * dr.opaque(mi.Float, shift)):
             return np.array(_values(case), np.float64)
 
     here = at(0.0)

@@ -176,17 +176,13 @@ def _without_density(law: Law, case: Case) -> None:
 
 def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
     cells = small_cells()
-    seen = np.zeros(len(cells.start))
-    expected = np.zeros(len(cells.start))
-    variance = np.zeros(len(cells.start))
+    counts = []
     for view in views:
-        seen += cells.counts(encode(view.samples.wo[view.density > 0]))
-        share, doubt = cells.integrals(partial(case.density, view), case.rng)
-        count = len(view.density)
-        expected += count * share[:, 0]
-        variance += count**2 * doubt[:, 0]
+        seen = cells.counts(encode(view.samples.wo[view.density > 0]))
+        expected = cells.expected(partial(case.density, view), len(view.density), case.rng)
+        counts.append([seen, *expected])
     view = max(views, key=lambda v: v.at.wi[2])
-    hold_small(law, cells, seen, expected, variance, FIT, view.at)
+    hold_small(law, cells, np.sum(counts, axis=0), FIT, view.at)
 
 
 def weight_in_stairs(size, weight, u):

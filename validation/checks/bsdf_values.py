@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks import bsdf_case, noise, probe
-from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, parameters
+from mrt_mitsuba.validation.checks import noise, probe
+from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, changed, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
 from mrt_mitsuba.validation.checks.faults import (
     GLASS,
@@ -205,7 +205,7 @@ COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
 AZIMUTHS = (0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4)
 INDICES = ("eta", "k", "int_ior", "ext_ior")
 UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
-WRONG = "results not finite, or negative{changed}: {faults}"
+WRONG = "results not finite, or negative{words_of_it}: {faults}"
 SPOILS = "one such number spoils a picture"
 
 
@@ -243,7 +243,7 @@ def finite(law: Law, case: Case) -> None:
     for key, value in parameters(case) if sound else ():
         for end in _ends(key, float(np.mean(np.array(value)))):  # one parameter at a time
             copy = case.copy()
-            with bsdf_case.changed(copy, key, partial(bsdf_case.affine, 0, end)):
+            with changed(copy, key, factor=0, summand=end):
                 _finite(law, copy, extremes, (key, end))
 
 
@@ -291,10 +291,10 @@ def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None =
     kinds = values if wrong_values else samples
     words = ", ".join(f"{kind} {faults.sum()}" for kind, faults in kinds.items() if faults.any())
     if words or not setting:
-        changed = f" with {setting[0]} = {setting[1]:g}" if setting else ""
+        words_of_it = f" with {setting[0]} = {setting[1]:g}" if setting else ""
         name = "values" if wrong_values else "samples"
         faults = np.any([*kinds.values()], axis=0)
-        law.hold(name, faults, at, setting=setting, changed=changed, faults=words or "none")
+        law.hold(name, faults, at, setting=setting, words_of_it=words_of_it, faults=words or "none")
     return not words
 
 
@@ -314,8 +314,7 @@ def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[
     lit = dr.any(weight != 0)
     value, pdf = case.plugin.eval_pdf(context(), probe.interaction(wi, uv), bs.wo, lit)
     value = mi.unpolarized_spectrum(value)
-    read = probe.not_finite(bs.pdf, bs.eta, value, pdf, least=0) | probe.not_unit(bs.wo)
-    bad = probe.not_finite(weight, least=0) | (lit & read)
+    bad = probe.bad_samples(weight, bs.wo, bs.pdf, bs.eta, value, pdf)
     return bad, {"wi": wi, "uv": uv, "u": u}
 
 

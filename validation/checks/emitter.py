@@ -210,17 +210,14 @@ def around_hole(size, ds, u):
     return put(ds, p=ds.p + ds.dist * (d - ds.d), d=d)
 
 
-def refused_in_hole(size, weight, u, ds):
-    return dr.select(in_hole(size, ds.d), 0, weight)
-
-
-def no_density_in_hole(size, pdf, ds):
-    return dr.select(in_hole(size, ds.d), 0, pdf)
+def nothing_in_hole(size, value, *given):
+    """No weight or density in a cone; the sample comes last."""
+    return dr.select(in_hole(size, given[-1].d), 0, value)
 
 
 def no_density_of_sample(size, ds, u):
     ds = around_hole(size, ds, u)
-    return put(ds, pdf=no_density_in_hole(size, ds.pdf, ds))
+    return put(ds, pdf=nothing_in_hole(size, ds.pdf, ds))
 
 
 @figures(
@@ -237,13 +234,13 @@ def no_density_of_sample(size, ds, u):
     ),
 )
 @finds("small", "no samples in a cone, in degrees", 3, direction=around_hole)
-@finds("small", "samples without weight in a cone, in degrees", 3, weight=refused_in_hole)
+@finds("small", "samples without weight in a cone, in degrees", 3, weight=nothing_in_hole)
 @finds(
     "dark",
     "no density in a cone, in degrees",
     3,
     direction=no_density_of_sample,
-    pdf=no_density_in_hole,
+    pdf=nothing_in_hole,
 )
 def sampling(law: Law, case: Case) -> None:
     """p = o + dist · d; directions to light from all around follow their density (Pearson's χ²)."""
@@ -282,13 +279,13 @@ def _in_small_cells(law: Law, case: Case) -> None:
     seen = np.zeros(len(cells.start))
     for _ in range(count // 2**20):
         seen += cells.counts(encode(_directions(case, rng.random((2**20, 2), np.float32))))
-    share, variance = cells.integrals(case.density, rng)
+    counts = np.array([seen, *cells.expected(case.density, count, rng)])
     # a corner of a bright texel may lie between the points of a cell
-    doubtful = chances_of(seen, count * share[:, 0], count**2 * variance[:, 0], SAME) < DOUBT
+    doubtful = chances_of(counts, SAME) < DOUBT
     if doubtful.any():
-        again = [cells[doubtful].integrals(case.density, rng) for _ in range(REPEATS)]
-        share[doubtful], variance[doubtful] = np.mean(again, axis=0)
-    hold_small(law, cells, seen, count * share[:, 0], count**2 * variance[:, 0], SAME)
+        again = [cells[doubtful].expected(case.density, count, rng) for _ in range(REPEATS)]
+        counts[1:, doubtful] = np.mean(again, axis=0)
+    hold_small(law, cells, counts, SAME)
 
 
 def _directions(case: Case, u: Array) -> Array:
@@ -347,9 +344,7 @@ def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[
     it = case.from_first()
     ds, weight = case.plugin.sample_direction(it, mi.Point2f(draw(), draw()))
     weight = mi.unpolarized_spectrum(weight)
-    lit = dr.any(weight != 0)
-    read = probe.not_finite(ds.pdf, ds.dist, least=0) | probe.not_unit(ds.d)
-    return probe.not_finite(weight, least=0) | (lit & read), {}
+    return probe.bad_samples(weight, ds.d, ds.pdf, ds.dist), {}
 
 
 LAWS = laws_in(sys.modules[__name__])

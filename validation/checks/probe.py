@@ -164,9 +164,14 @@ def not_finite(*values: mi.Float | mi.Spectrum, least: float = -np.inf) -> mi.Ma
     return bad
 
 
-def not_unit(d: mi.Vector3f) -> mi.Mask:
-    """Where directions are not of length 1, or not finite."""
-    return ~(dr.abs(dr.squared_norm(d) - 1) < 2e-3)
+def bad_samples(weight: mi.Spectrum, d: mi.Vector3f, *numbers: mi.Float | mi.Spectrum) -> mi.Mask:
+    """Where samples spoil a picture: by a weight that is not finite, or negative.
+
+    Or, unless the weight is 0, by such a one of ``numbers``, or a direction that is not of length 1.
+    """
+    not_unit = ~(dr.abs(dr.squared_norm(d) - 1) < 2e-3)
+    lit = dr.any(weight != 0)
+    return not_finite(weight, least=0) | (lit & (not_finite(*numbers, least=0) | not_unit))
 
 
 def lanes(call: Call, *columns: tuple[str, Array]) -> list[Array]:

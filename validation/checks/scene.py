@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,9 @@ def check_scene(
     runtime.use()
     source = open_scene(scene, **options)
     kinds = _plugins(source.scene)
+    lamps = partial(check_emitter, scene=source.scene)
+    check_of: dict[str, Callable[..., Check]]
+    check_of = {"BSDF": check_bsdf, "shape": check_shape, "emitter": lamps}
     checks = {}
     left_out = []
     chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}
@@ -105,7 +109,7 @@ def check_scene(
                 name = f"{kind} {plugin.id() or number}"
                 if name in checks:
                     name = f"{name} ({number})"
-                check = _check(kind.split()[0], plugin, source.scene, quick, seed)
+                check = check_of[kind.split()[0]](plugin, quick=quick, seed=seed)
                 checks[name] = replace(check, subject=name)
                 advance(1)
             more = len(alike) - len(chosen[kind])
@@ -117,20 +121,10 @@ def check_scene(
     return SceneCheck(source.name, checks, _hunt(source, quick, seed), tuple(left_out))
 
 
-def _check(word: str, plugin: mi.Object, scene: mi.Scene, quick: bool, seed: int) -> Check:
-    if word == "emitter":
-        return check_emitter(plugin, scene=scene, quick=quick, seed=seed)
-    check = check_bsdf if word == "BSDF" else check_shape
-    return check(plugin, quick=quick, seed=seed)
-
-
 def _plugins(scene: mi.Scene) -> dict[str, list[mi.Object]]:
     """The BSDFs, shapes and emitters of a scene, each once, by kind, but for instances."""
     shapes = [shape for shape in scene.shapes() if shape.class_name() != "Instance"]
-    bsdfs = {}
-    for shape in shapes:
-        if shape.bsdf() is not None:
-            bsdfs[str(id(shape.bsdf()))] = shape.bsdf()
+    bsdfs = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}
     kinds: dict[str, list[mi.Object]] = {}
     for word, plugins in (("BSDF", bsdfs.values()), ("shape", shapes), ("emitter", scene.emitters())):
         for plugin in plugins:

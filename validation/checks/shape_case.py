@@ -96,7 +96,7 @@ class Case(Subject):
             name = self.plugin.id()
             self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
             self.plugin.set_id(name)  # which the scene has changed
-            self.unsupported = self.unsupported or _refused(self.plugin)
+            self.unsupported = _refused(self.plugin)
         self.box = corners(self.plugin)
         if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
             raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
@@ -111,6 +111,7 @@ class Case(Subject):
         self.high = self.points.max(axis=0)
         self.middle = (self.low + self.high) / 2
         self.size = float(norm(self.high - self.low))
+        self.extent = np.maximum(self.high - self.low, 0.01 * self.size)
 
     def around(self, count: int) -> Array:
         """Points that look at the shape, from 1.5 sizes away. [count, 3]"""
@@ -120,8 +121,7 @@ class Case(Subject):
     def seen(self) -> Lanes:
         """Rays from all around to points in the box, and what they meet."""
         o = self.around(self.count(2**14, 2**17))
-        extent = np.maximum(self.high - self.low, 0.01 * self.size)
-        d = unit(self.middle + extent * self.rng.uniform(-0.55, 0.55, o.shape) - o)
+        d = unit(self.middle + self.extent * self.rng.uniform(-0.55, 0.55, o.shape) - o)
         return trace(self.target, o, d)
 
     @cached_property
@@ -178,14 +178,26 @@ class Case(Subject):
 
 
 def _refused(shape: mi.Shape) -> str:
-    """What Mitsuba warned of when it loaded a shape of its own, which loading one alike tells."""
+    """What Mitsuba warned of when it loaded a shape of its own: another one is loaded, warnings as errors."""
     params = mi.traverse(shape)
     stock = type(shape).__module__.startswith("mitsuba")
     if not stock or "to_world" not in params:
         return ""
     matrix = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
     kind = subject.class_name(shape).lower()
-    return subject.refused({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
+    logger = mi.logger()
+    levels = logger.log_level(), logger.error_level()
+    logger.set_log_level(mi.LogLevel.Warn)
+    logger.set_error_level(mi.LogLevel.Warn)
+    try:
+        mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
+    except RuntimeError as problem:
+        _, transform, words = str(problem).partition("'to_world' transform shouldn't")
+        return f"Mitsuba does not support it: {transform}{words}" if words else ""
+    finally:
+        logger.set_log_level(levels[0])
+        logger.set_error_level(levels[1])
+    return ""
 
 
 def offset(p: Array) -> Array:

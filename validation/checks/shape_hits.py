@@ -538,7 +538,7 @@ def finite(law: Law, case: Case) -> None:
 def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
     """Rays from all around and sampled positions, and which of them have numbers that are not finite."""
     middle = mi.Point3f(*map(float, case.middle))
-    extent = mi.Vector3f(*map(float, np.maximum(case.high - case.low, 0.01 * case.size)))
+    extent = mi.Vector3f(*map(float, case.extent))
     away = mi.warp.square_to_uniform_sphere(mi.Point2f(draw(), draw()))
     o = middle + 1.5 * case.size * away
     goal = middle + extent * (mi.Vector3f(draw(), draw(), draw()) - 0.5)

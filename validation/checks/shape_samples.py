@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.linalg import norm
+from scipy.linalg import null_space
 
 from mrt_mitsuba.validation.checks.faults import larger, member, off_surface, put, smaller, tilted
 from mrt_mitsuba.validation.checks.law import (
@@ -233,8 +234,7 @@ def _area(law: Law, case: Case, s: Lanes, area: float) -> None:
     axes = case.units(AXES)
     apart = [_distance(s.p @ axis, crossings @ axis) for axis in axes]
     for axis in np.eye(3):
-        across = crossings - np.outer(crossings @ axis, axis)
-        widths = np.linalg.svd(np.cov(across.T), compute_uv=False)
+        widths = np.linalg.svd(np.cov((crossings @ null_space(axis[None])).T), compute_uv=False)
         if widths[1] >= 1e-4 * widths[0]:  # else in one plane with the axis: azimuths around it are but two
             apart.append(_distance(_angle(s.p - case.middle, axis), _angle(crossings - case.middle, axis)))
     law.hold("spread", _chance(apart, size))
@@ -247,9 +247,8 @@ VIEWS = 3  # from which directions are compared
 
 def _angle(v: Array, axis: Array) -> Array:
     """Azimuths [N] of vectors [N, 3] around an axis [3]."""
-    across = unit(np.cross(axis, np.add(np.roll(axis, 1), (0.1, 0.2, 0.3))))
-    along = np.cross(axis, across)
-    return np.arctan2(v @ along, v @ across)
+    x, y = (v @ null_space(axis[None])).T
+    return np.arctan2(y, x)
 
 
 def _distance(x: Array, y: Array, weight: Array | None = None) -> float:
@@ -322,16 +321,19 @@ def _visible(dist: Array, pdf: Array, met: Lanes) -> Array:
     return np.where(visible, 1 / np.where(pdf > 0, pdf, 1), 0)
 
 
-# solid angle of the sphere around, from 1.5 sizes away: the sine of its half angle is a third
-CONE = 2 * np.pi * (1 - np.sqrt(1 - 1 / 9))
+# the sphere around, from 1.5 sizes away: the sine of its half angle is a third
+COSINE = float(np.sqrt(1 - 1 / 9))
+CONE = 2 * np.pi * (1 - COSINE)  # its solid angle
 
 
 def _into_cone(case: Case, o: Array, rng: np.random.Generator) -> Array:
     """Uniform directions from points [N, 3] into the cone that holds the shape. [N, 3]"""
-    axis = unit(case.middle - o)
-    across = unit(np.cross(axis, unit(rng.normal(size=(len(o), 3)))))
-    cos = 1 - rng.random((len(o), 1)) * CONE / (2 * np.pi)
-    return unit(cos * axis + np.sqrt(1 - cos**2) * across)
+
+    def direction(axis: mi.Vector3f, u: mi.Point2f) -> mi.Vector3f:
+        return mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(u, COSINE))
+
+    u = rng.random((len(o), 2), np.float32)
+    return lanes(direction, ("Vector3f", unit(case.middle - o)), ("Point2f", u))[0]
 
 
 def _aim(case: Case, count: int) -> float:

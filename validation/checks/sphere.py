@@ -134,6 +134,13 @@ class Cells(Lanes):
         values = function(wo.reshape(-1, 3)).reshape(*omega.shape, -1) * omega[..., None] * POINTS
         return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
 
+    def expected(
+        self, density: Callable[[Array], Array], count: int, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """How many of ``count`` samples of a density each cell expects, and the variance of that. [C], [C]"""
+        share, variance = self.integrals(density, rng)
+        return count * share[:, 0], count**2 * variance[:, 0]
+
     def rows(self) -> Iterator[Array]:
         """For each cell [C] the number of its row: of one r or azimuth, or in slices along x and y."""
         r, turn = self.corner
@@ -147,28 +154,28 @@ def small_cells() -> Cells:
     return Cells.around(np.zeros(0, np.int64), 0, SMALL)
 
 
-def hold_small(
-    law: Law, cells: Cells, seen: Array, expected: Array, variance: Array, known: float, at: Lanes = NOWHERE
-) -> None:
-    """Hold ``small`` to the least chance of what is ``seen`` in cells, and ``slices`` to that in their rows.
+def summed(counts: Array, group: Array) -> Array:
+    """The sums of counts [..., C] over groups of cells, by the number of the group of each [C]. [..., G]"""
+    return np.array([np.bincount(group, row) for row in counts])
 
-    ``variance``: of ``expected``; ``known``: to how much densities are known, relative.
+
+def hold_small(law: Law, cells: Cells, counts: Array, known: float, at: Lanes = NOWHERE) -> None:
+    """Hold ``small`` to the least chance of ``counts`` [3, C] in cells, and ``slices`` to that in their rows.
+
+    These are how many samples are seen, how many expected, and the variance of that number. ``known``: to how
+    much densities are known, relative.
     """
-    # where densities are not finite, the law ``finite`` says so
-    seen, expected, variance = np.where(np.isfinite(expected), [seen, expected, variance], 0)
-    chances = chances_of(seen, expected, variance, known)
+    counts = np.where(np.isfinite(counts[1]), counts, 0)  # where they are not, the law ``finite`` says so
+    chances = chances_of(counts, known)
     cell = cells.bounds(int(chances.argmin()))
     law.hold("small", sidak(chances.min(), 2 * len(chances)), at, cell=cell)
-    rows = []
-    for row in cells.rows():
-        many, wanted, doubt = (np.bincount(row, x) for x in (seen, expected, variance))
-        rows.append(chances_of(many, wanted, doubt, known))
-    chances = np.concatenate(rows)
+    chances = np.concatenate([chances_of(summed(counts, row), known) for row in cells.rows()])
     law.hold("slices", sidak(chances.min(), 2 * len(chances)), at)
 
 
-def chances_of(seen: Array, expected: Array, variance: Array, known: float) -> Array:
-    """The chances of so many or so few where a Poisson distribution expects as many."""
+def chances_of(counts: Array, known: float) -> Array:
+    """The chances of so many or so few where a Poisson distribution expects as many: of ``counts`` [3, C]."""
+    seen, expected, variance = counts
     room = 3 * np.sqrt(variance) + known * expected  # is not Poisson's
     many = stats.poisson.sf(seen - 1, expected + room)
     few = stats.poisson.cdf(seen, expected - room)
@@ -231,10 +238,9 @@ def chi_square(
     and z of a 16th. The second is the cell that is most off. ``known``: to how much the density is known,
     relative.
     """
-    seen = integrals.counts(codes)
     expected = count * integrals.mean[:, 0]
-    variance = count**2 * integrals.variance[:, 0]
-    neighbours = np.arange(len(seen))
+    counts = np.array([integrals.counts(codes), expected, count**2 * integrals.variance[:, 0]])
+    neighbours = np.arange(len(expected))
     ways = [(count / 25, neighbours), (128, neighbours), (16, neighbours)]
     ways += [(16, np.argsort(axis)) for axis in integrals.middle.T]
     tests = []
@@ -242,12 +248,10 @@ def chi_square(
         below = np.cumsum(expected[order])
         group = np.floor(below / max(count / parts, 25)).astype(int)
         group = np.minimum(group, max(group[-1] - 1, 0))
-        seen_in = np.bincount(group, seen[order])
-        expected_in = np.bincount(group, expected[order])
-        variance_in = np.bincount(group, variance[order])
-        variance_in += expected_in + (known * expected_in) ** 2
-        used = (seen_in > 0) | (expected_in > 1e-6)
-        pull = (seen_in - expected_in)[used] ** 2 / np.maximum(variance_in, 1e-6)[used]
+        seen, wanted, variance = summed(counts[:, order], group)
+        variance += wanted + (known * wanted) ** 2
+        used = (seen > 0) | (wanted > 1e-6)
+        pull = (seen - wanted)[used] ** 2 / np.maximum(variance, 1e-6)[used]
         tests.append((pull.sum(), max(len(pull), 1)))
-    worst = abs(seen - expected) / np.sqrt(expected + variance + 1)
+    worst = abs(counts[0] - expected) / np.sqrt(counts[1:].sum(axis=0) + 1)
     return np.array(tests), integrals.bounds(worst.argmax())

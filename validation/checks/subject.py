@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
-import tempfile
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from textwrap import indent
 from typing import Any
 
@@ -47,13 +44,11 @@ class Subject:
         self.seed = seed
         self.rng = np.random.default_rng(seed)
         self.description: Description | None = None  # None where a loaded object was given
-        self.unsupported = ""  # what Mitsuba's own warnings say against it
+        self.unsupported = ""  # what Mitsuba itself says against it
         if isinstance(given, dict):
             self.description = _kept(given)
             self.name = str(given.get("type", "dict"))
-            with _warnings_of_mitsuba() as lines:
-                self.plugin: mi.Object = load_dict(_made(self.description), f"the {self.name}")
-            self.unsupported = _refusal(lines)
+            self.plugin: mi.Object = load_dict(_made(self.description), f"the {self.name}")
         else:
             self.name = class_name(given)
             self.plugin = given
@@ -176,49 +171,6 @@ def class_name(plugin: mi.Object) -> str:
     """Name of a plugin's class: Mitsuba calls all those in Python by that of their base."""
     python = type(plugin).__module__.split(".")[0] != "mitsuba"
     return type(plugin).__name__ if python or not hasattr(plugin, "class_name") else plugin.class_name()
-
-
-@contextmanager
-def _warnings_of_mitsuba() -> Iterator[list[str]]:
-    """A list that has the lines of Mitsuba's warnings, once the block is left."""
-    lines: list[str] = []
-    logger = mi.logger()
-    level = logger.log_level()
-    printers = [logger.appender(i) for i in range(logger.appender_count())]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "log")
-        # to a file: a callback in Python may deadlock with Mitsuba's threads
-        appender = mi.StreamAppender(str(path))
-        quiet = level > mi.LogLevel.Warn
-        for printer in printers if quiet else ():
-            logger.remove_appender(printer)
-        logger.add_appender(appender)
-        logger.set_log_level(min(level, mi.LogLevel.Warn))
-        try:
-            yield lines
-        finally:
-            logger.set_log_level(level)
-            logger.remove_appender(appender)
-            for printer in printers if quiet else ():
-                logger.add_appender(printer)
-            del appender
-            lines += path.read_text(errors="replace").splitlines()
-
-
-def _refusal(lines: Iterable[str]) -> str:
-    """The first of Mitsuba's warnings that says that something is not supported; else ""."""
-    for line in lines:
-        words = line.partition(" WARN ")[2].strip()
-        if re.search(r"shouldn't|should not|n.t support|unsupported", words):
-            return f"Mitsuba does not support it: {words}"
-    return ""
-
-
-def refused(description: Description) -> str:
-    """What Mitsuba's warnings say against a plugin of a dict, "" if nothing."""
-    with _warnings_of_mitsuba() as lines, suppress(RuntimeError):
-        mi.load_dict(description)
-    return _refusal(lines)
 
 
 def _kept(value: Given) -> Given:
