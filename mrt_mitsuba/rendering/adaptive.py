@@ -101,7 +101,8 @@ class MrtAdaptive(mi.SamplingIntegrator):
         with dr.suspend_grad(), session(settings) as job:
             source = replace(opened("a Mitsuba scene", scene, view, self.nested), goal=self.bounded(spp))
             result = render_source(source, settings, job)
-            film, layers = view.film(), result.layers
+            film = view.film()
+            layers = result.layers
             names = [] if _has_bands_only(film) else self.aov_names()
             colors = [layers[name] for name in result.plan.bands] or list(np.moveaxis(result.image, -1, 0))
             alpha = [layers["A"]] if "A" in layers else []
@@ -119,15 +120,14 @@ class MrtAdaptive(mi.SamplingIntegrator):
         )
 
     def aov_names(self) -> list[str]:
-        return [*self.nested.aov_names(), *self._own_names()]
+        theirs = self.nested.aov_names()
+        return [*theirs, *(name for name in ("error.Y", "samples.Y") if name not in theirs)]
 
-    def _own_names(self) -> list[str]:
-        """The channels next to those of the nested integrator, whose names come first."""
-        return [name for name in ("error.Y", "samples.Y") if name not in self.nested.aov_names()]
-
-    def _further(self, film: mi.Film) -> int:
-        """Number of channels that a film takes up next to those of the nested integrator."""
-        return 0 if _has_bands_only(film) else len(self._own_names())
+    def _further(self, scene: mi.Scene, sensor: mi.Sensor | int) -> int:
+        """Number of channels that the film takes up next to those of the nested integrator."""
+        if _has_bands_only(_sensor(scene, sensor).film()):
+            return 0
+        return len(self.aov_names()) - len(self.nested.aov_names())
 
     def _seen(self, picture: mi.TensorXf, names: list[str]) -> mi.TensorXf:
         """What ``mi.render`` shows of a picture whose last channels have these ``names``.
@@ -153,8 +153,8 @@ class MrtAdaptive(mi.SamplingIntegrator):
         self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: int = 0, spp: int = 0
     ) -> mi.TensorXf:
         found = self.nested.render_forward(scene, params, sensor, seed, spp)
-        further = self._further(_sensor(scene, sensor).film())
-        return dr.concat([found, dr.zeros(mi.TensorXf, (*found.shape[:2], further))], axis=2)
+        nothing = dr.zeros(mi.TensorXf, (*found.shape[:2], self._further(scene, sensor)))
+        return dr.concat([found, nothing], axis=2)
 
     def render_backward(
         self,
@@ -165,16 +165,16 @@ class MrtAdaptive(mi.SamplingIntegrator):
         seed: int = 0,
         spp: int = 0,
     ) -> None:
-        kept = grad_in.shape[2] - self._further(_sensor(scene, sensor).film())
+        kept = grad_in.shape[2] - self._further(scene, sensor)
         self.nested.render_backward(scene, params, grad_in[..., :kept], sensor, seed, spp)
 
     def traverse(self, callback: Any) -> None:
         callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
 
     def to_string(self) -> str:
-        target, most = self.goal.target, self.goal.most
-        goal = f"spp={most}" if target is None else f"target={target}, max_spp={most}"
-        return f"MrtAdaptive[{goal}, max_seconds={self.goal.seconds or 0:g}, nested={text_of(self.nested)}]"
+        goal = self.goal
+        aim = f"spp={goal.most}" if goal.target is None else f"target={goal.target}, max_spp={goal.most}"
+        return f"MrtAdaptive[{aim}, max_seconds={goal.seconds or 0:g}, nested={text_of(self.nested)}]"
 
 
 def _goal(props: mi.Properties) -> Goal:

@@ -197,15 +197,17 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
             budget=job.budget,
         )
         job.start(plan, workspace)
-        log.info("scene %s loaded in %.3f s for %s", source.name, job.timings().load, plan.variant)
+        timings = job.timings
+        log.info("scene %s loaded in %.3f s for %s", source.name, timings.load, plan.variant)
         layers, error, rounds = _frames(shader, plan, job)
         job.collect()
-        log.info("%d kernels: compiled in %.3f s, ran for %.3f s", job.launches, job.compiling, job.running)
+        text = "%d kernels: compiled in %.3f s, ran for %.3f s"
+        log.info(text, job.launches, timings.compile, timings.kernels)
         return Result(
             image=layers["image"],
             layers=_channels(layers, plan),
             plan=plan if error is None else plan.resolved(error.target),
-            timings=job.timings(),
+            timings=timings,
             rays=job.rays,
             kernel_launches=job.launches,
             options=plan.options,

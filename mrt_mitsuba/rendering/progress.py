@@ -10,7 +10,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TextIO
 
 from mrt_mitsuba.interrupts import heed
@@ -140,15 +140,15 @@ def _ignore(steps: int) -> None:
     """Take no notice of progress."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Timings:
     """Seconds of one render; ``load`` and ``passes`` add up to about ``total``."""
 
-    total: float  #: all of the render
-    load: float  #: scene and plan
-    compile: float  #: kernels that were not in the cache
-    kernels: float  #: kernels running
-    passes: Mapping[str, float]  #: by the name of the pass
+    total: float = 0.0  #: all of the render
+    load: float = 0.0  #: scene and plan
+    compile: float = 0.0  #: kernels that were not in the cache
+    kernels: float = 0.0  #: kernels running
+    passes: dict[str, float] = field(default_factory=dict)  #: by the name of the pass
 
 
 class Job:
@@ -162,20 +162,17 @@ class Job:
         self.progress = progress
         self.budget = budget  #: bytes that it may use
         self._on_round = on_round
-        self.passes: dict[str, float] = {}  #: seconds by name
+        self.timings = Timings()  #: up to now
         self.rays = Counter(primary=0)  #: traced, by kind
         self.launches = 0  #: of kernels
-        self.compiling = 0.0  #: seconds
-        self.running = 0.0  #: seconds that kernels ran
         self._began = time.perf_counter()
-        self._loaded = self._began
         self._collected = 0.0  # when Dr.Jit's records were read last
 
     def start(self, plan: object, workspace: Workspace) -> None:
         """Begin with a plan, and with the memory next to its picture."""
         self.workspace = workspace
         self.progress.plan(plan)
-        self._loaded = time.perf_counter()
+        self.timings.load = time.perf_counter() - self._began
 
     @property
     def on_round(self) -> Callable[[RoundPicture], object] | None:
@@ -190,27 +187,19 @@ class Job:
 
         return show
 
-    def timings(self) -> Timings:
-        """The seconds of the render up to now."""
-        return Timings(
-            total=time.perf_counter() - self._began,
-            load=self._loaded - self._began,
-            compile=self.compiling,
-            kernels=self.running,
-            passes=self.passes,
-        )
-
     def collect(self) -> None:
         """Add up what Dr.Jit recorded since the last call. Records hold the kernels' text: many take room."""
         import drjit as dr
 
+        timings = self.timings
         self._collected = time.perf_counter()
+        timings.total = self._collected - self._began
         records = dr.kernel_history()
         self.progress.kernels(records)
         own = [record for record in records if record["type"] == dr.KernelType.JIT]
         self.launches += len(own)
-        self.compiling += sum(record["codegen_time"] + record["backend_time"] for record in own) / 1000
-        self.running += sum(record["execution_time"] for record in own) / 1000
+        timings.compile += sum(record["codegen_time"] + record["backend_time"] for record in own) / 1000
+        timings.kernels += sum(record["execution_time"] for record in own) / 1000
 
     @contextlib.contextmanager
     def stage(self, name: str, total: int, message: str = "") -> Iterator[Advance]:
@@ -228,5 +217,5 @@ class Job:
             yield advance_and_collect
             self.collect()
         seconds = time.perf_counter() - start
-        self.passes[name] = self.passes.get(name, 0.0) + seconds
+        self.timings.passes[name] = self.timings.passes.get(name, 0.0) + seconds
         log.info("%s: %d pixels in %.3f s", name, total, seconds)
