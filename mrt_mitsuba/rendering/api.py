@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from inspect import Parameter, Signature
@@ -34,12 +34,17 @@ from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import Source, open_scene, sized
 
-if TYPE_CHECKING:
-    from mrt_mitsuba.output.error import ErrorEstimate, Round
-
 log = logging.getLogger(__name__)
 Image = NDArray[np.float32]
 Options = ParamSpec("Options")
+
+if TYPE_CHECKING:
+    from mrt_mitsuba.output.error import ErrorEstimate, Round
+
+    class Render(Protocol[Options]):
+        """A function of a scene and the options of a render."""
+
+        def __call__(self, scene: Any = 0, *args: Options.args, **options: Options.kwargs) -> Result: ...
 
 
 @dataclass(frozen=True)
@@ -96,12 +101,6 @@ class Result:
         return files.png(self.image)
 
 
-class Render(Protocol[Options]):
-    """A function of a scene and the options of a render."""
-
-    def __call__(self, scene: Any = 0, *args: Options.args, **options: Options.kwargs) -> Result: ...
-
-
 def _with_options(settings: Callable[Options, RenderSettings]) -> Callable[[Any], Render[Options]]:
     """Let a function of a scene and ``**options`` show them in its signature and docstring."""
     fields = dataclasses.fields(cast(Any, settings))
@@ -115,7 +114,7 @@ def _with_options(settings: Callable[Options, RenderSettings]) -> Callable[[Any]
     def decorate(function: Any) -> Render[Options]:
         function.__signature__ = Signature([scene, *named], return_annotation="Result")
         function.__doc__ = function.__doc__.replace("        OPTIONS", lines)
-        return cast(Render[Options], function)
+        return cast("Render[Options]", function)
 
     return decorate
 
@@ -199,7 +198,9 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
         job.start(plan, workspace)
         timings = job.timings
         log.info("scene %s loaded in %.3f s for %s", source.name, timings.load, plan.variant)
-        layers, error, rounds = _frames(shader, plan, job)
+        picture = _frames(shader, plan, job)
+        layers = picture.layers
+        error = picture.error
         job.collect()
         text = "%d kernels: compiled in %.3f s, ran for %.3f s"
         log.info(text, job.launches, timings.compile, timings.kernels)
@@ -215,33 +216,31 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
             camera=camera_matrices(source.sensor),
             inputs=frozenset(os.path.abspath(path) for path in job.budget.inputs),
             error=error,
-            rounds=tuple(rounds),
+            rounds=tuple(picture.rounds),
         )
 
 
-def _frames(
-    shader: Shader, plan: Plan, job: Job
-) -> tuple[dict[str, np.ndarray], ErrorEstimate | None, Sequence[Round]]:
-    """Trace the plan's frames: the mean of their layers in the region, [H, W, channels] each; and the
-    error and the rounds of the last frame.
+def _frames(shader: Shader, plan: Plan, job: Job) -> Passes:
+    """Trace the plan's frames: the picture of the first one, with the mean of all in its layers, cut to the
+    region, [H, W, channels] each.
 
     Layers that are no averages are those of the first frame.
     """
-    total = dict[str, np.ndarray]()
-    averaged = set[str]()
-    for frame in range(plan.frames):
-        passes = Passes(job, shader, plan, frame)
-        layers = passes.run()
-        if frame == 0:
-            total = layers
-            averaged = {n for n in layers if n not in LAYER_TABLE or LAYER_TABLE[n].source == AVERAGED}
-            continue
+    picture = Passes(job, shader, plan, 0)
+    picture.run()
+    layers = picture.layers
+    averaged = [name for name in layers if name not in LAYER_TABLE or LAYER_TABLE[name].source == AVERAGED]
+    for frame in range(1, plan.frames):
+        following = Passes(job, shader, plan, frame)
+        following.run()
         for name in averaged:
-            total[name] += layers[name]
-    for name in averaged if plan.frames > 1 else ():
-        total[name] /= np.float32(plan.frames)
+            layers[name] += following.layers[name]
     inside = plan.region.inside(plan.seen)
-    return {name: values[inside] for name, values in total.items()}, passes.error, passes.rounds
+    for name, values in layers.items():
+        if plan.frames > 1 and name in averaged:
+            values /= np.float32(plan.frames)
+        layers[name] = values[inside]
+    return picture
 
 
 def _channels(layers: Mapping[str, np.ndarray], plan: Plan) -> dict[str, Image]:

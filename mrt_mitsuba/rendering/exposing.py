@@ -10,7 +10,7 @@ are traced in wavefronts, split where they would not fit into memory; in scalar 
 from __future__ import annotations
 
 import logging
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -43,20 +43,22 @@ class Groups:
 
     size: int
     pixels: Any  #: of each entry: numbers row by row, those of a second picture after those of the first
-    counts: np.ndarray | None = None  #: groups of each entry; None: one
-    first: np.ndarray | None = None  #: number of an entry's first ray among all of its pixel; None: 0
+    #: [2, entries], the number of groups and the number of their first ray among all of the pixel; None: one
+    #: group for each entry, which begins with ray 0
+    shares: np.ndarray | None = None
     before: int = 0  #: groups in earlier wavefronts
 
     @classmethod
     def shared_out(cls, size: int, counts: np.ndarray, before: np.ndarray) -> Groups:
         """``counts`` groups in each picture and pixel, [pictures, pixels], after ``before`` rays there."""
         chosen = np.flatnonzero(counts)
-        return cls(size, chosen, counts.ravel()[chosen], before.ravel()[chosen].astype(np.int64))
+        shares = np.stack([counts.ravel()[chosen], before.ravel()[chosen]])
+        return cls(size, chosen, shares.astype(np.int64))
 
     @property
     def count(self) -> int:
         """Number of groups."""
-        return len(self.pixels) if self.counts is None else int(self.counts.sum())
+        return len(self.pixels) if self.shares is None else int(self.shares[0].sum())
 
     @property
     def rays(self) -> int:
@@ -68,7 +70,7 @@ class Groups:
         rays = np.zeros(pixels, np.int64)
         given = self.pixels
         at = slice(given.start, given.stop) if isinstance(given, range) else given
-        rays[at] = self.size if self.counts is None else self.size * self.counts
+        rays[at] = self.size if self.shares is None else self.size * self.shares[0]
         return rays
 
     def parts(self, most: int, width: int) -> Iterator[tuple[slice, Groups]]:
@@ -76,44 +78,40 @@ class Groups:
 
         Yields the entries in each part, and their groups.
         """
-        every = self
-        if self.counts is not None and self.first is not None and self.counts.max(initial=0) > most:
-            every = self._cut_up(self.counts, self.first, most)
-        count = len(every.pixels)
-        ends = None if every.counts is None else np.cumsum(every.counts)
+        pixels = self.pixels
+        shares = self.shares
+        if shares is not None and shares[0].max(initial=0) > most:
+            # several entries for a pixel of more groups
+            pieces = -(-shares[0] // most)
+            number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+            counts, first = np.repeat(shares, pieces, axis=1)
+            shares = np.stack([np.minimum(counts - most * number, most), first + self.size * most * number])
+            pixels = np.repeat(pixels, pieces)
+        # groups up to the end of each entry
+        ends: Any = range(1, len(pixels) + 1) if shares is None else np.cumsum(shares[0])
         start = 0
         before = 0
-        while start < count:
-            stop = start + most if ends is None else int(np.searchsorted(ends, before + most, "right"))
-            if stop < count:
-                row = bisect_left(every.pixels, every.pixels[stop] // width * width)
+        while start < len(pixels):
+            stop = bisect_right(ends, before + most)
+            if stop < len(pixels):
+                row = bisect_left(pixels, pixels[stop] // width * width)
                 stop = row if row > start else stop
-            part = slice(start, min(stop, count))
-            counts = None if every.counts is None else every.counts[part]
-            first = None if every.first is None else every.first[part]
-            some = Groups(self.size, every.pixels[part], counts, first, before)
-            yield part, some
-            before += some.count
+            part = slice(start, stop)
+            yield part, Groups(self.size, pixels[part], None if shares is None else shares[:, part], before)
+            before = int(ends[stop - 1])
             start = stop
-
-    def _cut_up(self, counts: np.ndarray, first: np.ndarray, most: int) -> Groups:
-        """The same groups, with several entries for a pixel of more than ``most``."""
-        pieces = -(-counts // most)
-        number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        counts = np.minimum(np.repeat(counts, pieces) - most * number, most)
-        first = np.repeat(first, pieces) + self.size * most * number
-        return Groups(self.size, np.repeat(self.pixels, pieces), counts, first)
 
     def lanes(self) -> tuple[mi.UInt32, mi.UInt32]:
         """The pixel of each ray, and its number among all rays of the pixel."""
         ray = dr.arange(mi.UInt32, self.rays)
         entry, number = divide(ray, self.size)
-        if self.counts is not None and self.first is not None:
-            starts = np.cumsum(self.counts) - self.counts  # the first group of each entry
+        if self.shares is not None:
+            counts, first = self.shares
+            starts = np.cumsum(counts) - counts  # the first group of each entry
             begins = dr.zeros(mi.UInt32, self.count)
             dr.scatter(begins, mi.UInt32(1), mi.UInt32(starts))
             entry = dr.gather(mi.UInt32, dr.cumsum(begins), entry) - 1
-            number = ray + dr.gather(mi.UInt32, mi.UInt32(self.first - self.size * starts), entry)
+            number = ray + dr.gather(mi.UInt32, mi.UInt32(first - self.size * starts), entry)
         if isinstance(self.pixels, range):
             return entry + opaque(self.pixels.start), number
         return dr.gather(mi.UInt32, mi.UInt32(self.pixels), entry), number
@@ -374,8 +372,7 @@ class Exposer:
         places = list[tuple[float, float]]()
         values = dict[str, list[Any]]()
         for entry, pixel in enumerate(groups.pixels):
-            count = 1 if groups.counts is None else int(groups.counts[entry])
-            first = 0 if groups.first is None else int(groups.first[entry])
+            count, first = (1, 0) if groups.shares is None else groups.shares[:, entry].tolist()
             for number in range(first, first + groups.size * count):
                 place, traced = self.trace(int(pixel), number, starts, groups.before)
                 heed()

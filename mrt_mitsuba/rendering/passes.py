@@ -47,8 +47,8 @@ class Passes:
         self.error: ErrorEstimate | None = None
         self.rounds: Sequence[Round] = ()
 
-    def run(self) -> dict[str, np.ndarray]:
-        """Run the passes of the plan; return the layers."""
+    def run(self) -> None:
+        """Run the passes of the plan."""
         stack: Stack | None = None  # of what a film has been exposed to
         seen = self._plan.seen
         for step in self._plan.passes:
@@ -70,7 +70,6 @@ class Passes:
                 stack = self._expose(step, exposer, stack)
         if "samples" in self._plan.layers and "samples" not in self.layers:
             self._layer("samples")[:] = self._plan.samples
-        return self.layers
 
     # ------------------------------------------ Rays of a pass --------------------------------------
 
