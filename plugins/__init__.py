@@ -89,12 +89,7 @@ def is_known(thing: object) -> bool:
     What somebody else wrote in Python may depend on anything, and is asked each time.
     """
     module = type(thing).__module__
-    return module.split(".", 1)[0] == "mitsuba" or is_ours(thing)
-
-
-def is_ours(thing: object) -> bool:
-    """Return whether this folder has the class of an object."""
-    return type(thing).__module__.startswith(f"{__name__}.")
+    return module.split(".", 1)[0] == "mitsuba" or module.startswith(f"{__name__}.")
 
 
 def any_constructed() -> bool:

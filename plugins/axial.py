@@ -49,7 +49,7 @@ class AxialMesh(mi.Mesh):
         write_buffers(self, vertex_texcoords=uvs, **self.table.stand_in())
         parameters = dict(zip(self.ends, map(mi.Point3f, ends), strict=True))
         self.parameters = {**parameters, "radius": updatable(radius)}
-        keep_apart(self, name, len(faces))
+        keep_apart(self, name)
 
     def _place(self, *parameters: Sequence) -> None:
         """Make the table of the exact quadric, in double precision, from both ends and [radius]."""

@@ -14,18 +14,11 @@ import numpy as np
 
 from .fresnel import f0_from_ior
 from .kernel_plan import GRADIENTS, VARYING, Mirror
-from .lobes import LOBES, TABLED, Lobes, Pair
+from .lobes import LOBES, NUMBERS, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .variants import first, is_jit, largest, updatable, varies
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
-
-# Parameters that are numbers, or textures of one channel, with their defaults and limits
-SCALARS: dict[str, tuple[float, dict[str, float]]] = {
-    "alpha": (0.1, {}),
-    "int_ior": (1.5, {"above": 0}),
-    "ext_ior": (1.0, {"above": 0}),
-}
 
 
 class MrtBSDF(mi.BSDF):
@@ -82,7 +75,7 @@ class MrtBSDF(mi.BSDF):
         self.fresnel = choice(props, "fresnel", FRESNEL_FORMS)
         self.sample_visible = flag(props, "sample_visible", True)
         self.parameters: dict[str, Any] = {}
-        for name, (default, limits) in SCALARS.items():
+        for name, (default, limits) in NUMBERS.items():
             textured = name in props and props.type(name) == mi.Properties.Type.Object
             self.parameters[name] = (
                 spectrum(props, name) if textured else updatable(number(props, name, default, **limits))
@@ -120,7 +113,7 @@ class MrtBSDF(mi.BSDF):
         """Return a parameter at a surface point."""
         parameter = self.parameters[name]
         if isinstance(parameter, mi.Texture):
-            return parameter.eval_1(si, active) if name in SCALARS else parameter.eval(si, active)
+            return parameter.eval_1(si, active) if name in NUMBERS else parameter.eval(si, active)
         return parameter if is_jit() else first(parameter)
 
     def lobes(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Lobes:
@@ -138,7 +131,7 @@ class MrtBSDF(mi.BSDF):
         if dr.grad_enabled(given):
             return GRADIENTS
         row = np.zeros((1 + len(LOBES), 4))
-        parts = [given[name] for name in TABLED], *(given[lobe.reflectance] for lobe in LOBES)
+        parts = [given[name] for name in NUMBERS], *(given[lobe.reflectance] for lobe in LOBES)
         for k, part in enumerate(parts):
             row[k, : len(part)] = [first(value) for value in part]
         return row

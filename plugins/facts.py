@@ -11,11 +11,12 @@ import numpy as np
 from . import classes_of, is_known, plugin
 from .kernel_plan import Mirror, SceneFacts
 from .lights import brightness
-from .lobes import LOBES, material_rows
+from .lobes import LOBES
+from .materials import has_mirror, is_mrt_bsdf, is_oriented, is_textured, material_rows
 from .parameters import ParameterError
 from .simple_shapes import is_sphere
 from .snapshot import Kept, Snapshot
-from .variants import is_jit, varies
+from .variants import is_jit
 
 # Beyond these sizes, Embree's products of three lengths leave float32
 SMALLEST_MESH = 1e-8
@@ -138,30 +139,3 @@ def _read_materials(snapshot: Snapshot) -> tuple[list[np.ndarray], dict[str, Any
         "unmergeable": unmergeable,
     }
     return rows, facts
-
-
-def is_mrt_bsdf(bsdf: mi.BSDF) -> bool:
-    """Return whether a material is an ``mrt_bsdf`` itself: a class derived from it may be anything."""
-    return type(bsdf) is plugin("bsdf").MrtBSDF
-
-
-def has_mirror(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF reflects like a mirror."""
-    return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
-
-
-def is_textured(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
-    if is_mrt_bsdf(bsdf):
-        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
-    return any(varies(node) or not is_known(node) for node in mi.traverse(bsdf).hierarchy)
-
-
-def is_oriented(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF depends on how the surface is turned about its normal."""
-    if is_mrt_bsdf(bsdf):
-        return False
-    names = {node.class_name() for node in mi.traverse(bsdf).hierarchy}
-    if names & {"BumpMap", "NormalMap"} or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):
-        return True
-    return not is_known(bsdf)

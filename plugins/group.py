@@ -60,7 +60,7 @@ class MrtGroup(mi.Mesh):
             if len(values) != len(numbers):
                 raise ParameterError(f'mrt_group: "{name}" has {len(values)} rows for {len(numbers)} objects')
             self.add_attribute(name, values.shape[1], np.repeat(values, faces, axis=0).ravel())
-        keep_apart(self, "mrt_group", sizes[1])
+        keep_apart(self, "mrt_group")
 
     def moving_frame(self) -> None:
         """Return None: a group has no differentiable parameters."""

@@ -61,19 +61,25 @@ class MrtLight(mi.Emitter):
         dr.make_opaque(self.position)
 
     def row(self, it: mi.Interaction3f, active: mi.Bool = True) -> list[Any]:
-        """Return position and intensity at the wavelengths of ``it``; more, for other kinds: vectors of
-        three."""
+        """Return position and intensity, the latter at the wavelengths of ``it``.
+
+        A class that derives from this one appends vectors of three, which ``arriving`` then gets.
+        """
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = it.wavelengths
         return [self.position, self.intensity.eval(si, active)]
 
     @staticmethod
     def arriving(d: mi.Vector3f, intensity: mi.UnpolarizedSpectrum, *more: mi.Vector3f) -> Any:
-        """Return what arrives at a point from which the light is seen along the unit vector ``d``."""
+        """Return the irradiance, at normal incidence, of a point that sees the light along the unit vector
+        ``d``.
+
+        The other arguments are the vectors of ``row`` after the position.
+        """
         return intensity
 
     def fixed_row(self) -> list[list[float]] | None:
-        """Return the row as plain numbers; None where they vary, or where derivatives are wanted."""
+        """Return ``row`` as plain numbers; None where they vary, or where derivatives are wanted."""
         row = None if varies(self.intensity) else self.row(dr.zeros(mi.Interaction3f))
         if row is None or dr.grad_enabled(row):
             return None

@@ -1,7 +1,7 @@
 """The lights of a scene, as rows of a table in place of calls to plugins where they are known.
 
-A light of the table is an ``mrt_light``, or derives from ``plugin("light").MrtLight``, adds to its ``row``
-and overrides ``arriving``.
+A light of the table is an ``mrt_light``, or one of a class that derives from ``plugin("light").MrtLight``,
+appends to its ``row`` and overrides ``arriving``.
 """
 
 from __future__ import annotations
@@ -46,13 +46,14 @@ class Lights:
         if form == "loop":
             self.called = pointer("Emitter", lights)
         elif form != "none" and light_rows is not None:
-            kinds = [type(light) for light in lights]
-            self.kinds = list(dict.fromkeys(kinds))  # the kernel holds these only
-            self.kind_of = [self.kinds.index(kind) for kind in kinds]
+            self.kind_of = [type(light) for light in lights]
+            #: the kinds that the kernel holds, and how many vectors a row of each has
+            self.kinds = dict(zip(self.kind_of, map(len, light_rows), strict=True))
             if form == "table":
-                parts = np.zeros((1 + max(map(len, light_rows)), len(lights), 3))
+                kinds = list(self.kinds)
+                parts = np.zeros((1 + max(self.kinds.values()), len(lights), 3))
                 for k, row in enumerate(light_rows):
-                    parts[0, k] = self.kind_of[k]
+                    parts[0, k] = kinds.index(self.kind_of[k])
                     parts[1 : 1 + len(row), k] = row
                 self.parts = [Table(mi.Vector3f, part) for part in parts]
             else:
@@ -62,24 +63,24 @@ class Lights:
         self, light: Any, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.UnpolarizedSpectrum]:
         """Return the direction from ``it`` to a light, by its number, and what arrives from it."""
-        kind: Any = None
+        number: Any = None  # of the kind, where there are several
         if self.called is not None:
             called = self.called
             one = called[light] if self.unrolled else dr.gather(mi.EmitterPtr, called, light, active)
             return one.sample_direction(it, sample, active)
         if self.unrolled:
-            kinds = [self.kinds[self.kind_of[light]]]
+            kinds = [self.kind_of[light]]
             row = self.rows[light]
         else:
-            kinds = self.kinds
+            kinds = list(self.kinds)
             row = [part(light, active) for part in self.parts[1:]]
-            kind = self.parts[0](light, active).x if len(kinds) > 1 else None
-        ds = towards(mi.Point3f(row[0]), it)
-        channels = dr.size_v(mi.UnpolarizedSpectrum)
-        row = [mi.UnpolarizedSpectrum(list(row[1])[:channels]), *row[2:]]
-        arriving = kinds[0].arriving(ds.d, *row)
-        for k, other in enumerate(kinds[1:], start=1):
-            arriving = dr.select(kind == k, other.arriving(ds.d, *row), arriving)
+            number = self.parts[0](light, active).x if len(kinds) > 1 else None
+        position, color, *more = row
+        ds = towards(mi.Point3f(position), it)
+        intensity = mi.UnpolarizedSpectrum(list(color)[: dr.size_v(mi.UnpolarizedSpectrum)])
+        arriving, *others = (kind.arriving(ds.d, intensity, *more[: self.kinds[kind] - 2]) for kind in kinds)
+        for k, other in enumerate(others, start=1):
+            arriving = dr.select(number == k, other, arriving)
         return ds, arriving
 
 

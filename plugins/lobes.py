@@ -1,23 +1,15 @@
-"""The lobes of ``mrt_bsdf``: a table of them, what they make at a surface point, and a scene's materials.
-
-Mitsuba calls each BSDF of a scene in turn, and the Python code of each runs to record the call: 1 ms for an
-instance, at every render. Lobes from a ``MaterialTable`` are recorded once, for any number of materials.
-"""
+"""The lobes of ``mrt_bsdf``: a table of them, and their value, density and samples at a surface point."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from . import plugin
 from .fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
-from .kernel_plan import SCALAR_VARIANT
 from .microfacet import (
     beckmann_d,
     half_vector_angles,
@@ -27,8 +19,6 @@ from .microfacet import (
     tan2_theta,
     visible_over_cos,
 )
-from .table import names_in
-from .variants import ByShape, is_jit
 
 # Roughness below this (zero included) acts as this: the lobe is then narrower than float32 directions can
 # resolve, and D, its inverse square, still fits. Above the other, D is the same everywhere but at the horizon
@@ -140,8 +130,13 @@ Lobe = Diffuse | Specular
 # In the order of the components of the BSDF
 LOBES: tuple[Lobe, ...] = (Diffuse(), Specular())
 
-# Numbers of materials; their table has up to four columns
-TABLED = ("alpha", "int_ior", "ext_ior")
+# Parameters that are numbers, or textures of one channel, with their defaults and limits: up to four of them,
+# which is what a row of the table of materials holds
+NUMBERS: dict[str, tuple[float, dict[str, float]]] = {
+    "alpha": (0.1, {}),
+    "int_ior": (1.5, {"above": 0}),
+    "ext_ior": (1.0, {"above": 0}),
+}
 
 
 @dataclass(eq=False)
@@ -253,41 +248,3 @@ def _enabled(ctx: mi.BSDFContext) -> list[tuple[int, Lobe]]:
 def _within(x: mi.Float, least: float, most: float) -> mi.Float:
     """Return ``x`` between two limits; NaN gives the lower one."""
     return dr.select(x >= least, dr.minimum(x, most), least)
-
-
-def material_rows(shapes: Sequence[mi.Shape]) -> list[np.ndarray] | str:
-    """Return the ``fixed_row`` of the material of each shape, or why they have no place in one table."""
-    bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
-    # Of the class itself: one derived from it may have other lobes
-    mergeable = bool(bsdfs) and {type(b) for b in bsdfs.values()} == {plugin("bsdf").MrtBSDF}
-    obstacles = {
-        SCALAR_VARIANT: not is_jit(),
-        "a spectral variant": mi.is_spectral,
-        # Inside an instance, shapes are not the scene's own
-        "instances in the scene": any(s.class_name() == "Instance" for s in shapes),
-        f"a material other than {names_in('materials')}": not mergeable,
-        "materials of different Fresnel formulas": mergeable and len({b.fresnel for b in bsdfs.values()}) > 1,
-    }
-    reasons = [why for why, holds in obstacles.items() if holds]
-    rows = {} if reasons else {key: bsdf.fixed_row() for key, bsdf in bsdfs.items()}
-    reasons += [row for row in rows.values() if isinstance(row, str)]
-    return reasons[0] if reasons else [rows[id(s.bsdf())] for s in shapes]
-
-
-class MaterialTable:
-    """The parameters of the materials, as rows of ``material_rows``: looked up, they make ``Lobes``."""
-
-    def __init__(self, shapes: Sequence[mi.Shape], rows: Sequence[np.ndarray]) -> None:
-        self.fresnel = shapes[0].bsdf().fresnel
-        self.by_shape = ByShape(mi.Vector4f, shapes, rows, [1] * 4)
-
-    def lobes(self, si: mi.SurfaceInteraction3f) -> Lobes:
-        """Return the lobes at a surface point."""
-        # One mask for all lights, or they would be looked up for each
-        numbers = self.by_shape(si, mi.Bool(True))
-        channels = dr.size_v(mi.UnpolarizedSpectrum)
-        given = dict(zip(TABLED, numbers, strict=False))
-        for part, lobe in enumerate(LOBES, start=1):
-            color = self.by_shape(si, mi.Bool(True), part)
-            given[lobe.reflectance] = mi.UnpolarizedSpectrum(list(color)[:channels])
-        return Lobes(self.fresnel, given, si.wi)

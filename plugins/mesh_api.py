@@ -11,9 +11,9 @@ from .parameters import ParameterError, transform
 from .variants import is_jit
 
 
-def keep_apart(mesh: mi.Mesh, name: str, faces: int) -> None:
+def keep_apart(mesh: mi.Mesh, name: str) -> None:
     """Keep Mitsuba from merging the mesh with others of its BSDF: it leaves those with attributes alone."""
-    mesh.add_attribute(f"face_{name}", 1, [0.0] * faces)
+    mesh.add_attribute(f"face_{name}", 1, [0.0] * mesh.face_count())
 
 
 def write_buffers(mesh: mi.Mesh, **buffers: np.ndarray | mi.Float) -> None:

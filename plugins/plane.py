@@ -65,7 +65,7 @@ class MrtPlane(mi.Mesh):
             vertex_texcoords=corners.astype(np.float32).ravel(),
             faces=np.array([0, 1, 2, 0, 2, 3], dtype=np.uint32),
         )
-        keep_apart(self, "mrt_plane", 2)
+        keep_apart(self, "mrt_plane")
 
     def to_string(self) -> str:
         return f"MrtPlane[normal={self.unit_normal.tolist()}, distance={self.distance:g}]"

@@ -101,9 +101,20 @@ class Axial:
     slope = 0
     parts: tuple[int, ...] = (LATERAL, BASE)
     ends = (DISC, DISC)
+    first_hit: Callable
+    side: Callable[[int], UnitMesh]
 
     def __init__(self, *, capped: bool = True) -> None:
         self.closed = capped
+
+    def intersect(self, o, d, frame: Frame):
+        """Return t > 0 of the first hit in units of |d|, inf for a miss, and the part that is hit."""
+        return self.first_hit(o, d, frame, capped=self.closed)
+
+    def mesh(self, segments: int) -> UnitMesh:
+        """Return the side, and the discs of a closed one."""
+        ends = enumerate(self.ends) if self.closed else ()
+        return _join(self.side(segments), *(_disc(segments, z) for z, end in ends if end == DISC))
 
     def frame(self, p0, p1, radius) -> Frame:
         """Return the frame whose z runs from p0 to p1; seen against it, u grows counter-clockwise.
@@ -163,34 +174,27 @@ class Cone(Axial):
 
     slope = 1
     ends = (POINT, DISC)
+    first_hit = staticmethod(intersect_cone)
 
-    def intersect(self, o, d, frame: Frame):
-        """Return t > 0 of the first hit in units of |d|, inf for a miss, and the part that is hit."""
-        return intersect_cone(o, d, frame, capped=self.closed)
-
-    def mesh(self, segments: int) -> UnitMesh:
-        """Return a fan from the apex, with a vertex and a normal there for each triangle, and the base."""
+    def side(self, segments: int) -> UnitMesh:
+        """Return a fan from the apex, with a vertex and a normal there for each triangle."""
         azimuth = 2 * np.pi * np.arange(segments + 1) / segments
         between = 0.5 * (azimuth[1:] + azimuth[:-1])
         apex = _ring(between, 0.0, slope=-1.0, v=1.0, radius=0.0)
         rim = _ring(azimuth, 1.0, slope=-1.0, v=0.0)
         i = np.arange(segments)
         faces = np.stack([i, i + segments + 1, i + 1], axis=1)
-        side = np.concatenate([rim, apex]), faces
-        return _join(side, _disc(segments, 1.0)) if self.closed else side
+        return np.concatenate([rim, apex]), faces
 
 
 class Cylinder(Axial):
     """Radius 1 from z = 0 to z = 1."""
 
     parts = (LATERAL, BASE, TOP)
+    first_hit = staticmethod(intersect_cylinder)
 
-    def intersect(self, o, d, frame: Frame):
-        """Return t > 0 of the first hit in units of |d|, inf for a miss, and the part that is hit."""
-        return intersect_cylinder(o, d, frame, capped=self.closed)
-
-    def mesh(self, segments: int) -> UnitMesh:
-        """Return a strip of quads split in two, and two discs."""
+    def side(self, segments: int) -> UnitMesh:
+        """Return a strip of quads, each split in two."""
         azimuth = 2 * np.pi * np.arange(segments + 1) / segments
         i = np.arange(segments)
         k = i + segments + 1
@@ -198,8 +202,7 @@ class Cylinder(Axial):
         lower = np.stack([i, i + 1, k], axis=1)
         upper = np.stack([i + 1, k + 1, k], axis=1)
         faces = np.concatenate([lower, upper])
-        side = np.concatenate(rings), faces
-        return _join(side, _disc(segments, 0.0), _disc(segments, 1.0)) if self.closed else side
+        return np.concatenate(rings), faces
 
 
 KINDS: dict[str, Any] = {

@@ -13,11 +13,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .facts import Reading, has_mirror
+from .facts import Reading
 from .hit_errors import CURVED, HitErrors
 from .kernel_plan import KernelPlan
 from .lights import Lights
-from .lobes import LOBES, MaterialTable, Pair
+from .lobes import LOBES, Pair
+from .materials import MaterialTable, has_mirror
 from .point_buffer import PointBuffer
 from .quadrics import Quadrics
 from .simple_shapes import Planes, Spheres

@@ -94,11 +94,21 @@ def test_other_kinds_of_lights_join_the_table():
             return [*super().row(it, active), mi.Vector3f(0.6, 0, 0.8)]
 
         @staticmethod
-        def arriving(d: Any, intensity: Any, *more: Any) -> Any:
-            return intensity * dr.clip(2 * dr.dot(d, more[0]) - 1, 0, 1)
+        def arriving(d: Any, intensity: Any, axis: Any) -> Any:
+            return intensity * dr.clip(2 * dr.dot(d, axis) - 1, 0, 1)
+
+    class TintedLight(plugin("light").MrtLight):  # type: ignore[misc]
+        def row(self, it: Any, active: Any = True) -> list[Any]:
+            return [*super().row(it, active), mi.Vector3f(0, 0, 1), mi.Vector3f(0.9, 0.5, 0.1)]
+
+        @staticmethod
+        def arriving(d: Any, intensity: Any, axis: Any, tint: Any) -> Any:
+            return intensity * mi.UnpolarizedSpectrum(tint) * dr.square(dr.dot(d, axis))
 
     mi.register_emitter("leaning", LeaningLight)
-    for kinds in (["leaning"], ["mrt_light", "leaning"], ["leaning", "mrt_light"]):
+    mi.register_emitter("tinted", TintedLight)
+    three = ["tinted", "mrt_light", "leaning"]
+    for kinds in (["leaning"], ["mrt_light", "leaning"], ["leaning", "mrt_light"], three):
         used = [kinds[k % len(kinds)] for k in range(9)]
         nodes: dict[str, Any] = {"type": "scene"}
         nodes["integrator"] = {"type": "mrt_whitted", "max_depth": 1, "min_contribution": 0.0}

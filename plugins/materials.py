@@ -1,0 +1,84 @@
+"""The materials of a scene, as rows of a table in place of calls to plugins where they are known.
+
+Mitsuba calls each BSDF of a scene in turn, and the Python code of each runs to record the call: 1 ms for an
+instance, at every render. Lobes from a ``MaterialTable`` are recorded once, for any number of materials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import is_known, plugin
+from .kernel_plan import SCALAR_VARIANT
+from .lobes import LOBES, NUMBERS, Lobes
+from .table import names_in
+from .variants import ByShape, is_jit, varies
+
+
+def material_rows(shapes: Sequence[mi.Shape]) -> list[np.ndarray] | str:
+    """Return the ``fixed_row`` of the material of each shape, or why they have no place in one table."""
+    bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
+    # Of the class itself: one derived from it may have other lobes
+    mergeable = bool(bsdfs) and {type(b) for b in bsdfs.values()} == {plugin("bsdf").MrtBSDF}
+    obstacles = {
+        SCALAR_VARIANT: not is_jit(),
+        "a spectral variant": mi.is_spectral,
+        # Inside an instance, shapes are not the scene's own
+        "instances in the scene": any(s.class_name() == "Instance" for s in shapes),
+        f"a material other than {names_in('materials')}": not mergeable,
+        "materials of different Fresnel formulas": mergeable and len({b.fresnel for b in bsdfs.values()}) > 1,
+    }
+    reasons = [why for why, holds in obstacles.items() if holds]
+    rows = {} if reasons else {key: bsdf.fixed_row() for key, bsdf in bsdfs.items()}
+    reasons += [row for row in rows.values() if isinstance(row, str)]
+    return reasons[0] if reasons else [rows[id(s.bsdf())] for s in shapes]
+
+
+class MaterialTable:
+    """The parameters of the materials, as rows of ``material_rows``: looked up, they make ``Lobes``."""
+
+    def __init__(self, shapes: Sequence[mi.Shape], rows: Sequence[np.ndarray]) -> None:
+        self.fresnel = shapes[0].bsdf().fresnel
+        self.by_shape = ByShape(mi.Vector4f, shapes, rows, [1] * 4)
+
+    def lobes(self, si: mi.SurfaceInteraction3f) -> Lobes:
+        """Return the lobes at a surface point."""
+        # One mask for all lights, or they would be looked up for each
+        numbers = self.by_shape(si, mi.Bool(True))
+        channels = dr.size_v(mi.UnpolarizedSpectrum)
+        given = dict(zip(NUMBERS, numbers, strict=False))
+        for part, lobe in enumerate(LOBES, start=1):
+            color = self.by_shape(si, mi.Bool(True), part)
+            given[lobe.reflectance] = mi.UnpolarizedSpectrum(list(color)[:channels])
+        return Lobes(self.fresnel, given, si.wi)
+
+
+def is_mrt_bsdf(bsdf: mi.BSDF) -> bool:
+    """Return whether a material is an ``mrt_bsdf`` itself: a class derived from it may be anything."""
+    return type(bsdf) is plugin("bsdf").MrtBSDF
+
+
+def has_mirror(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF reflects like a mirror."""
+    return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
+
+
+def is_textured(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
+    if is_mrt_bsdf(bsdf):
+        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
+    return any(varies(node) or not is_known(node) for node in mi.traverse(bsdf).hierarchy)
+
+
+def is_oriented(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF depends on how the surface is turned about its normal."""
+    if is_mrt_bsdf(bsdf):
+        return False
+    names = {node.class_name() for node in mi.traverse(bsdf).hierarchy}
+    if names & {"BumpMap", "NormalMap"} or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):
+        return True
+    return not is_known(bsdf)
