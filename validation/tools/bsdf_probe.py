@@ -26,11 +26,16 @@ def at_angle(degrees: float) -> Array:
     return np.array([np.sin(theta) * 0.8, np.sin(theta) * 0.6, np.cos(theta)])
 
 
-def mirrored(wi: Array, slope: Array, azimuth: Array) -> Array:
-    """The directions [N, 3] into which half vectors of these slopes and azimuths [N] mirror ``wi`` [N, 3]."""
-    m = np.stack([slope * np.cos(azimuth), slope * np.sin(azimuth), np.ones(len(wi))], axis=-1)
+def pairs_about(cosine: Array, slope: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Pairs of directions [N, 3] with half vectors of these slopes [N], at random azimuths, in float32.
+
+    The first ones have these cosines [N] to the normal; the second ones may point down.
+    """
+    phi, psi = rng.uniform(0, 2 * np.pi, (2, len(cosine)))
+    wi = direction(cosine, phi)
+    m = np.stack([slope * np.cos(psi), slope * np.sin(psi), np.ones_like(slope)], axis=-1)
     m /= np.linalg.norm(m, axis=-1, keepdims=True)
-    return np.asarray(2 * (wi * m).sum(axis=-1, keepdims=True) * m - wi)
+    return wi, np.float32(2 * (wi * m).sum(axis=-1, keepdims=True) * m - wi)
 
 
 def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array]:
@@ -41,9 +46,8 @@ def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array
     rng = np.random.default_rng(seed)
     pairs = np.empty((2, 0, 3))
     while pairs.shape[1] < count:
-        wi = direction(rng.uniform(0.02, 1, 4 * count), rng.uniform(0, 2 * np.pi, 4 * count))
         slope = alpha * 4 * np.sqrt(rng.random(4 * count))
-        wo = mirrored(wi, slope, rng.uniform(0, 2 * np.pi, 4 * count))
+        wi, wo = pairs_about(rng.uniform(0.02, 1, 4 * count), slope, rng)
         pairs = np.concatenate([pairs, np.stack([wi, wo])[:, wo[:, 2] > 0.02]], axis=1)
     return unit(pairs[0, :count]), unit(pairs[1, :count])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -12,6 +13,6 @@ class Case:
     name: str
     what: str  #: is measured
     why: str  #: it is held to its limit, or cannot hold
-    measured: float
+    measured: float = math.nan
     limit: float | None = None  #: None where nothing can be promised
     at_most: bool = True  #: else: at least

@@ -14,14 +14,19 @@ from numpy.linalg import norm
 
 from mrt_mitsuba.plugins import fresnel
 from mrt_mitsuba.scene.model import Cone, Cylinder, Plane, Sphere
-from mrt_mitsuba.validation.checks.probe import direction
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.oracles.reference import Array, dot, unit
-from mrt_mitsuba.validation.studies.roughconductor import ours as lobe
-from mrt_mitsuba.validation.studies.roughconductor import theirs as other_lobe
-from mrt_mitsuba.validation.studies.stability.geometry import MIRROR, ROUNDING, ends, lit, trace_of
+from mrt_mitsuba.validation.oracles.reference import Array, dot, smith_g1, unit
+from mrt_mitsuba.validation.studies import roughconductor
+from mrt_mitsuba.validation.studies.stability.geometry import (
+    MIRROR,
+    ROUNDING,
+    ends,
+    first_hits,
+    lit,
+    trace_of,
+)
 from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, mirrored
+from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, pairs_about
 from mrt_mitsuba.validation.tools.study import Study, Values
 
 if TYPE_CHECKING:
@@ -65,15 +70,17 @@ def curves(axis: Axis, *, places: int, count: int) -> tuple[Array, Curves]:
 
 def show(study: Study, *, quick: bool, places: int = 0) -> None:
     """Add the diagram of all axes and its table to a study, and hold ours to its promised limit."""
-    lines = {}
     rows = []
-    for axis in study.each("Axes", AXES):
-        x, line = curves(axis, places=places or (9 if quick else 33), count=24 if quick else 96)
-        lines[axis] = x, line
-        ours, theirs, first = (line[name].max() for name in (OURS, THEIRS, FIRST))
+    caption = (
+        "Roundings of float32 (6e-8). Blue: ours. Orange: what of Mitsuba's comes nearest. Grey, dashed: the "
+        "formula as one would write it first. Dotted: the limit promised for ours."
+    )
+    for number, axis in enumerate(study.each("Axes", AXES)):
+        x, lines = curves(axis, places=places or (9 if quick else 33), count=24 if quick else 96)
+        ours, theirs, first = (line.max() for line in lines.values())
         why = "the limit of the tables below, in roundings; worst place of this axis"
         study.at_most(f"roundings along the {axis.label}: {axis.title}", ours, axis.limit, why)
-        broken = x[line[FIRST] > 100 * axis.limit]
+        broken = x[lines[FIRST] > 100 * axis.limit]
         row = {
             "what": axis.title,
             "along": axis.label,
@@ -85,30 +92,21 @@ def show(study: Study, *, quick: bool, places: int = 0) -> None:
             "which breaks at": f"{broken[0]:.0e} … {broken[-1]:.0e}" if len(broken) else "nowhere",
         }
         rows.append(row)
-    caption = (
-        "Roundings of float32 (6e-8). Blue: ours. Orange: what of Mitsuba's comes nearest. Grey, dashed: the "
-        "formula as one would write it first. Dotted: the limit promised for ours."
-    )
-    for number, axis in enumerate(AXES):
         title = f"{axis.title} along the {axis.label}"
-        plot = roundings(axis, *lines[axis])
-        study.picture(f"roundings {number}", title, plot, "" if number else caption)
+        study.picture(f"roundings {number}", title, roundings(axis, x, lines), "" if number else caption)
     note = f"One rounding is 2⁻²⁴. {WORST:.0%} of the samples of a place stay below its figure."
     study.records("roundings", "Where it breaks, and where ours does not", rows, note, first=True)
 
 
 def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
     """Draw errors in roundings of float32 along an axis; all axes have the same scale."""
-    looks: dict[str, Values] = {
-        FIRST: {"color": diagrams.GREY, "linestyle": (0, (4, 2)), "linewidth": 1.4},
-        THEIRS: {"color": diagrams.COLORS[1], "linewidth": 1.4},
-        OURS: {"color": diagrams.COLORS[0], "linewidth": 2.4},
-    }
     drawn, axes = diagrams.panel(axis.title, 4.6, 3.2)
+    blue, orange, *_ = diagrams.COLORS
     axes.axhspan(0.1, axis.limit, color="#dcebf7", zorder=0)
-    axes.axhline(axis.limit, color=diagrams.COLORS[0], linestyle=":", linewidth=1)
-    for name, look in looks.items():
-        axes.plot(x, lines[name], **look)
+    axes.axhline(axis.limit, color=blue, linestyle=":", linewidth=1)
+    axes.plot(x, lines[FIRST], color=diagrams.GREY, linestyle=(0, (4, 2)), linewidth=1.4)
+    axes.plot(x, lines[THEIRS], color=orange, linewidth=1.4)
+    axes.plot(x, lines[OURS], color=blue, linewidth=2.4)
     axes.set(xscale="log", yscale="log", ylim=(0.2, 10 * NONE_RIGHT))
     axes.set_xlabel(axis.label, **diagrams.WORDS)
     axes.set_ylabel("error in roundings", **diagrams.WORDS)
@@ -117,9 +115,13 @@ def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
     axes.text(
         0.5, 1.3 * NONE_RIGHT, "no digit is right", color=diagrams.GREY, fontsize=diagrams.LABELS, **place
     )
-    labels = {FIRST: FIRST, THEIRS: axis.nearest, OURS: OURS}
-    ends = {label: (x[-1], lines[name][-1], looks[name]["color"]) for name, label in labels.items()}
-    diagrams.label_ends(axes, ends | {"promised": (x[-1], axis.limit, diagrams.COLORS[0])})
+    ends = {
+        FIRST: (x[-1], lines[FIRST][-1], diagrams.GREY),
+        axis.nearest: (x[-1], lines[THEIRS][-1], orange),
+        OURS: (x[-1], lines[OURS][-1], blue),
+        "promised": (x[-1], axis.limit, blue),
+    }
+    diagrams.label_ends(axes, ends)
     return drawn
 
 
@@ -135,50 +137,37 @@ def _off(values: Mapping[str, object], truth: Array) -> Curves:
 # ------------------------------------------ Reflectance ------------------------------------------
 
 
-BSDFS = {OURS: lobe, THEIRS: other_lobe}
+def _lobes(count: int, cosine: Array, alpha: float) -> Curves:
+    """Measure the lobe D G / (4 cos θi), without Fresnel, for light from these cosines [count].
 
-
-def _pairs(count: int, cosine: Array, alpha: float) -> tuple[Array, Array]:
-    """Pairs of directions [N, 3] whose half vector is within twice the slope alpha."""
+    Half vectors are within twice the slope alpha.
+    """
     rng = np.random.default_rng(11)
-    phi, psi = rng.uniform(0, 2 * np.pi, (2, count))
-    wi = direction(cosine, phi)
-    wo = np.float32(mirrored(wi, 2 * alpha * np.sqrt(rng.random(count)), psi))
+    wi, wo = pairs_about(cosine, 2 * alpha * np.sqrt(rng.random(count)), rng)
     up = wo[:, 2] > 0
-    return wi[up], wo[up]
-
-
-def _lobes(wi: Array, wo: Array, alpha: float) -> Curves:
-    """The roundings of the lobe D G / (4 cos θi), without Fresnel."""
-    exactly = exact.number(np.float32(alpha))
-    truth = [exact.lobe(i, o, exactly).value for i, o in zip(wi, wo, strict=True)]
-    lobes = {name: evaluate(mi.load_dict(of(alpha)), wi, wo)[0][:, 0] for name, of in BSDFS.items()}
-    # as the report has it, of cosines alone, in float32
+    wi = wi[up]
+    wo = wo[up]
     a = np.float32(alpha)
+    truth = [exact.lobe(i, o, exact.number(a)).value for i, o in zip(wi, wo, strict=True)]
+    bsdfs = {OURS: roughconductor.ours, THEIRS: roughconductor.theirs}
+    lobes = {name: evaluate(mi.load_dict(of(float(a))), wi, wo)[0][:, 0] for name, of in bsdfs.items()}
+    # as the report has it, of cosines alone, in float32
     c = unit(wi + wo)[:, 2]
     d = np.exp((c**2 - 1) / (c**2 * a**2)) / (np.float32(np.pi) * a**2 * c**4)
-    g = _first_g1(wi[:, 2], a) * _first_g1(wo[:, 2], a)
+    cosines = np.stack([wi[:, 2], wo[:, 2]])
+    g = smith_g1(cosines / (a * np.sqrt(1 - cosines**2))).prod(axis=0)
     lobes[FIRST] = d * g / (4 * wi[:, 2] * wo[:, 2]) * wo[:, 2]
     return _off(lobes, np.array(truth, float))
 
 
-def _first_g1(cosine: Array, alpha: np.float32) -> Array:
-    tangent = np.sqrt(1 - cosine**2) / cosine
-    b = 1 / (alpha * tangent)
-    fit = (3.535 * b + 2.181 * b**2) / (1 + 2.276 * b + 2.577 * b**2)
-    return np.where(b < 1.6, fit, 1)
-
-
 def roughness(alpha: float, count: int) -> Curves:
     """Measure the lobe at a roughness, for directions that are not grazing."""
-    alpha = float(np.float32(alpha))
-    cosine = np.random.default_rng(3).uniform(0.2, 1, count)
-    return _lobes(*_pairs(count, cosine, alpha), alpha)
+    return _lobes(count, np.random.default_rng(3).uniform(0.2, 1, count), alpha)
 
 
 def grazing(cosine: float, count: int) -> Curves:
     """Measure a lobe of roughness 0.3 at so small a cosine of the light's direction."""
-    return _lobes(*_pairs(count, np.full(count, cosine), 0.3), float(np.float32(0.3)))
+    return _lobes(count, np.full(count, cosine), 0.3)
 
 
 def index(above: float, count: int) -> Curves:
@@ -203,26 +192,25 @@ def index(above: float, count: int) -> Curves:
 def _hits(
     thing: Cone | Cylinder | Plane | Sphere,
     rays: Rays,
-    distance: Callable[[Array], Array],
     first: Array,
     stock: Mapping[str, object] | None = None,
 ) -> Curves:
     """How far hits of rays (o, d [N, 3], float32) are off a surface, in roundings of coordinates.
 
-    ``distance``: of points [N, 3] from the surface, in float64; ``first``: t of a formula in float32.
-    ``stock``: a shape of Mitsuba's, for what it has no shape of our own for: there it sees our mesh.
+    ``first``: t of a formula in float32. ``stock``: a shape of Mitsuba's, for what it has no shape of our own
+    for: there it sees our mesh.
     """
     o, d = rays
     scene = mi.load_dict(lit(f"{type(thing).__name__.lower()}s", thing, (9e6, 9e6, 9e6)))
-    other = mi.load_dict({"type": "scene", "shape": dict(stock)}) if stock else scene
+    other = mi.load_dict({"type": "scene", "shape": stock}) if stock else scene
     ours = np.array(trace_of(scene, o, d).hit.si.t)
     theirs = np.array(other.ray_intersect(mi.Ray3f(o.T, d.T)).t)
+    truth, normal = first_hits(thing, o, d)
+    scale = np.maximum(abs(o).max(axis=1), abs(o + truth[:, None] * d).max(axis=1))
     errors = {}
     for name, t in ((OURS, ours), (THEIRS, theirs), (FIRST, first)):
         hit = np.isfinite(t) & (t > 0)
-        p = o + np.where(hit, t, 0).astype(np.float64)[:, None] * d
-        scale = np.maximum(abs(o).max(axis=1), abs(p).max(axis=1))
-        errors[name] = np.where(hit, abs(distance(p)) / scale / ROUNDING, NONE_RIGHT)
+        errors[name] = np.where(hit, abs((t - truth) * dot(normal, d)) / scale / ROUNDING, NONE_RIGHT)
     return errors
 
 
@@ -231,6 +219,7 @@ def _aimed(targets: Array, eyes: Array) -> Rays:
     return o, np.float32(unit(targets - o))
 
 
+@np.errstate(invalid="ignore")  # rounding may leave no root
 def _quadratic(a: Array, b: Array, c: Array, holds: Callable[[Array], Array] = np.isfinite) -> Array:
     """The first root t beyond an offset that ``holds``, by a schoolbook's float32 formula; else infinity."""
     root = np.sqrt(b * b - 4 * a * c)
@@ -239,7 +228,7 @@ def _quadratic(a: Array, b: Array, c: Array, holds: Callable[[Array], Array] = n
     return both.min(axis=0)
 
 
-def ball(count: int, *, scale: float = 1.0, far: float = 3.0) -> Curves:
+def of_scale(scale: float, count: int, *, far: float = 3.0) -> Curves:
     """Measure hits of a ball of radius ``scale``, seen from ``far`` radii away."""
     rng = np.random.default_rng(5)
     eyes = unit(rng.normal(size=(count, 3))) * scale * far
@@ -247,29 +236,25 @@ def ball(count: int, *, scale: float = 1.0, far: float = 3.0) -> Curves:
     o, d = _aimed(across * rng.uniform(0, 0.9, (count, 1)), eyes)
     r = np.float32(scale)
     first = _quadratic(dot(d, d), 2 * dot(o, d), dot(o, o) - r * r)
-    radius = float(r)
+    stock = {"type": "sphere", "radius": float(r)}
+    return _hits(Sphere((0, 0, 0), float(r), MIRROR), (o, d), first, stock)
 
-    def distance(p: Array) -> Array:
-        return norm(p, axis=1) - radius
 
-    stock = {"type": "sphere", "radius": radius}
-    return _hits(Sphere((0, 0, 0), radius, MIRROR), (o, d), distance, first, stock)
+def of_distance(far: float, count: int) -> Curves:
+    """Measure hits of a ball of radius 1 at a distance, in its radii."""
+    return of_scale(1.0, count, far=far)
 
 
 def floor(far: float, count: int) -> Curves:
     """Measure hits of a floor at a distance, in heights of the eye."""
     rng = np.random.default_rng(6)
-    normal = np.array([0.6, 0.64, 0.48])
-    up = unit(np.float32(normal).astype(np.float64))
+    normal = np.array([0.6, 0.64, 0.48], np.float32).astype(np.float64)  # as the plugin rounds it
+    up = unit(normal)
     o, d = _aimed(far * unit(np.cross(rng.normal(size=(count, 3)), up)), np.tile(up, (count, 1)))
     first = -(o @ np.float32(up)) / (d @ np.float32(up))
     turned = mi.ScalarTransform4f().look_at([0, 0, 0], up.tolist(), [0, 0, 1]).scale(2 * far)
     stock = {"type": "rectangle", "to_world": turned}
-
-    def distance(p: Array) -> Array:
-        return p @ up
-
-    return _hits(Plane(tuple(normal), 0.0, MIRROR), (o, d), distance, first, stock)
+    return _hits(Plane(tuple(normal), 0.0, MIRROR), (o, d), first, stock)
 
 
 def axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curves:
@@ -278,12 +263,11 @@ def axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curv
     At a depth below the tip its radius is ``wide + slope * depth``.
     """
     rng = np.random.default_rng(7)
-    height = min(slender, 1.0)
     radius = min(1 / slender, 1.0)
-    tip = np.float32(height / 2 * unit(np.subtract(*ends(1.0)))).astype(np.float64)
+    tip = np.float32(min(slender, 1.0) / 2 * unit(np.subtract(*ends(1.0)))).astype(np.float64)
     base = -tip
-    along = unit(tip - base)
-    height = float(norm(tip - base))
+    along = unit(tip)
+    height = 2 * float(norm(tip))
     wide, slope = (0.0, radius / height) if kind is Cone else (radius, 0.0)
     outwards = unit(np.cross(along, rng.normal(size=(count, 3))))
     depth = height * rng.uniform(0.2, 0.8, (count, 1))
@@ -291,27 +275,24 @@ def axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curv
     normal = unit(outwards + slope * along)
     rays = _aimed(targets, targets + 3 * unit(normal + 0.3 * rng.normal(size=(count, 3))))
 
-    def distance(p: Array) -> Array:
-        depth = (tip - p) @ along
-        r = norm(p - tip + depth[:, None] * along, axis=1)
-        return (r - wide - slope * depth) / np.hypot(1, slope)
-
     stock = {"type": "cylinder", "p0": base, "p1": tip, "radius": radius} if kind is Cylinder else None
-    first = _first_side(rays, tip, along, np.float32(slope), np.float32(wide))
+    first = _first_side(rays, np.float32(tip), np.float32(-along), np.float32(slope), np.float32(wide))
     thing = kind(tuple(tip.tolist()), tuple(base.tolist()), radius, MIRROR)
-    return _hits(thing, rays, distance, first, stock)
+    return _hits(thing, rays, first, stock)
 
 
-def _first_side(rays: Rays, tip: Array, axis: Array, tangent: np.float32, r: np.float32) -> Array:
-    """Distances t of |q|² = (r + tangent · depth)², q across the axis, as one would write it first."""
+def _down_and_across(v: Array, down: Array) -> tuple[Array, Array]:
+    """The parts of vectors [N, 3] along a unit vector [N], and across it [N, 3]."""
+    depth = v @ down
+    return depth, v - depth[:, None] * down
+
+
+def _first_side(rays: Rays, tip: Array, down: Array, slope: np.float32, r: np.float32) -> Array:
+    """Distances t of |q|² = (r + slope · depth)², q across the axis, as one would write it first."""
     o, d = rays
-    down = -np.float32(axis)
-    from_tip = o - np.float32(tip)
-    depth = from_tip @ down
-    faster = d @ down
-    q = from_tip - depth[:, None] * down
-    across = d - faster[:, None] * down
-    k = tangent**2
+    depth, q = _down_and_across(o - tip, down)
+    faster, across = _down_and_across(d, down)
+    k = slope**2
     a = dot(across, across) - k * faster**2
     b = 2 * (dot(q, across) - k * depth * faster)
     c = dot(q, q) - k * depth**2 - r * r
@@ -320,14 +301,6 @@ def _first_side(rays: Rays, tip: Array, axis: Array, tangent: np.float32, r: np.
         return depth + t * faster >= 0
 
     return _quadratic(a, b, c, below_tip)  # one half of a double cone
-
-
-def of_scale(scale: float, count: int) -> Curves:
-    return ball(count, scale=scale)
-
-
-def of_distance(far: float, count: int) -> Curves:
-    return ball(count, far=far)
 
 
 LOBE = 2e-5 / ROUNDING

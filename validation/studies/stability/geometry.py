@@ -6,8 +6,8 @@ The laws of ``check_shape`` hold what needs no other renderer; here, rays have a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -40,60 +40,24 @@ SHARE_SCALED = 0.001
 SHARE_MOVED = 1e-4
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a scene is put, and the largest share of pixels that may change; None where it cannot hold."""
-
-    name: str
-    factor: float  #: of all lengths
-    sizes: float  #: that it is moved by, in scene sizes
-    why: str
-    most: float | None
-
-
-def scaled(factor: float) -> Place:
-    return Place(f"times {factor:g}", factor, 0, "the same picture", SHARE_SCALED)
-
-
-def moved(sizes: float) -> Place:
-    """A place a number of scene sizes away; very far away, float32 has no digits left for the scene."""
-    step = sizes * 2**-23
-    why = f"coordinates have steps of {step:.0e} scene sizes there: normals and outlines move"
-    most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
-    return Place(f"moved by {sizes:g} sizes", 1, sizes, why, most)
-
-
-PLACES = (
-    *(scaled(factor) for factor in (1e-6, 1e-3, 1e3, 1e6)),
-    *(moved(sizes) for sizes in (1.0, 10.0, 100.0, 1e3, 1e4)),
-)
-
 WHERE = f"sizes 1e-6 … 1e6, from 1e-6 to {FARTHEST:g} sizes away and from inside"
-
-
-class Limit(NamedTuple):
-    """What a figure of the rays at a size is, why it must be so, and the most that it may be."""
-
-    what: str
-    why: str
-    most: float
-
-
-LIMITS = {  # by the name of the figure, in the order of ``measure``
-    "place": Limit(
+FIGURES = (  # of the rays at a size, in the order of ``measure``
+    Case(
+        "place",
         f"{WHERE}: worst distance error across the surface, in roundings of the largest coordinate",
         "what intersection and a ray's own t lose",
-        16,
+        limit=16,
     ),
-    "hits": Limit(
+    Case(
+        "hits",
         f"rays that hit or miss wrongly, {OUTLINE} roundings and more off the outline, or find a distance, "
         "normal or colour that is no finite number",
         "the same",
-        0,
+        limit=0,
     ),
-    "mirror rays": Limit("mirror rays that meet the surface they leave", "they start off it", 0),
-    "shadow rays": Limit("points that their own surface hides from a light above it", "the same", 0),
-}
+    Case("mirror rays", "mirror rays that meet the surface they leave", "they start off it", limit=0),
+    Case("shadow rays", "points that their own surface hides from a light above it", "the same", limit=0),
+)
 
 MIRROR = Material(1.5, 1.0, (1, 1, 1), (1, 1, 1))
 CORNERS = np.array([(-0.8, -0.5, 0.1), (0.9, -0.3, -0.2), (0.1, 0.9, 0.3)])
@@ -122,23 +86,35 @@ def cases(quick: bool) -> Iterator[Case]:
     for kind in solids(1):
         sizes = DECADES[::3] if quick else DECADES
         worst = np.max([measure(kind, size, count) for size in sizes], axis=0)
-        for (name, limit), figure in zip(LIMITS.items(), worst, strict=True):
-            yield Case(f"{kind}, {name}", limit.what, limit.why, figure, limit.most)
+        for case, figure in zip(FIGURES, worst, strict=True):
+            yield replace(case, name=f"{kind}, {case.name}", measured=figure)
     # Scene 2 shows the horizon, which a far plane can cut off
     for number in (0, 2, 3) if quick else range(5):
         scene = replace(report_scene(number), focal_distance=None)
-        base = picture(scene)
-        for place in PLACES:
-            image = picture(placed(scene, place.factor, place.sizes))
-            off = abs(image - base).max(axis=-1)
-            share = np.mean(~(off <= VISIBLE))  # NaN is off
-            what = "share of pixels off by more than 2/255"
-            yield Case(f"scene {number} {place.name}", what, place.why, share, place.most)
+        yield from scaled_and_moved(scene, f"scene {number}")
 
 
-def picture(scene: Scene) -> Array:
-    """Render with one ray per pixel; [H, W, 3]."""
-    return render(scene, width=120, height=90, aa=1, aamode="none").image
+def scaled_and_moved(scene: Scene, name: str) -> Iterator[Case]:
+    """Yield the share of pixels that change where a scene is scaled, and moved by multiples of its size."""
+
+    def picture(scene: Scene) -> Array:
+        return render(scene, width=120, height=90, aa=1, aamode="none").image  # [H, W, 3]
+
+    base = picture(scene)
+
+    def changed(factor: float, sizes: float) -> float:
+        off = abs(picture(placed(scene, factor, sizes)) - base).max(axis=-1)
+        return float(np.mean(~(off <= VISIBLE)))  # NaN is off
+
+    what = "share of pixels off by more than 2/255"
+    for factor in (1e-6, 1e-3, 1e3, 1e6):
+        yield Case(f"{name} times {factor:g}", what, "the same picture", changed(factor, 0), SHARE_SCALED)
+    for sizes in (1.0, 10.0, 100.0, 1e3, 1e4):
+        step = sizes * 2**-23
+        why = f"coordinates have steps of {step:.0e} scene sizes there: normals and outlines move"
+        # Very far away, float32 has no digits left for the scene
+        most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
+        yield Case(f"{name} moved by {sizes:g} sizes", what, why, changed(1, sizes), most)
 
 
 def placed(scene: Scene, factor: float, sizes: float) -> Scene:
@@ -181,16 +157,14 @@ def measure(kind: str, size: float, count: int) -> list[float]:
     direct = np.array(trace.direct[0])
     t = np.array(trace.hit.si.t, np.float64)
 
-    length = norm(np.float64(d), axis=1)
-    unit_d = d / length[:, None]
-    distance, _, normal, *_ = nearest([thing], o, unit_d)
+    truth, normal = first_hits(thing, o, d)
     # an object enlarged is the same as rays from nearer by
     reach = OUTLINE * rounding
-    nearer, farther = (nearest([thing], o / (1 + r)[:, None], unit_d)[0] for r in (reach, -reach))
-    exists = np.isfinite(distance)
+    nearer, farther = (first_hits(thing, o / (1 + r)[:, None], d)[0] for r in (reach, -reach))
+    exists = np.isfinite(truth)
     both = hit & exists
     cosine = np.where(both, dot(normal, d), 1)
-    away = np.where(both, distance / length, 0)
+    away = np.where(both, truth, 0)
     p = o + away[:, None] * d
     front = both & (cosine < -FLATTEST)
     height = dot(unit(light - p), normal)
@@ -205,6 +179,13 @@ def measure(kind: str, size: float, count: int) -> list[float]:
         (front & (np.array(trace.bounces) > 1)).sum(),
         (front & above & ~(direct > 0)).sum(),
     ]
+
+
+def first_hits(thing: Any, o: Array, d: Array) -> tuple[Array, Array]:
+    """The first hits of rays (o + t d) with an object in float64: t [N], inf for none, and normals [N, 3]."""
+    length = norm(np.float64(d), axis=1)
+    distance, _, normal, *_ = nearest([thing], o, d / length[:, None])
+    return distance / length, normal
 
 
 def lit(kind: str, thing: Any, light: Sequence[float]) -> Values:

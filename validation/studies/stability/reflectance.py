@@ -14,7 +14,7 @@ from mrt_mitsuba.plugins import fresnel, microfacet
 from mrt_mitsuba.plugins.quadric_kinds import Columns
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies.stability.case import Case
-from mrt_mitsuba.validation.tools.bsdf_probe import mirrored
+from mrt_mitsuba.validation.tools.bsdf_probe import pairs_about
 
 # Of tan²θh / alpha², minus the logarithm of exp(-…): the lobe is at 1e-7 of its peak, and at 1e-20
 IN_BOUND, STEEPEST = -np.log([1e-7, 1e-20])
@@ -162,11 +162,7 @@ def lobes_with_truth(count: int) -> Arrays:
     alpha = np.float32(10 ** rng.uniform(-8, 2, drawn))
     cosine = 10 ** rng.uniform(-7, 0, drawn)
     slope = alpha * np.sqrt(STEEPEST * rng.random(drawn) ** 2)
-    sine = np.sqrt((1 - cosine) * (1 + cosine))
-    phi, psi = rng.uniform(0, 2 * np.pi, (2, drawn))
-    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], axis=1)
-    wo = np.float32(mirrored(wi, slope, psi))
-    wi = np.float32(wi)
+    wi, wo = pairs_about(cosine, slope, rng)
     x, y, z = (np.float64(wi) + wo).T  # along the half vector
     steepness = (x**2 + y**2) / (z * alpha) ** 2
     keep = (wo[:, 2] > 5e-8) & (steepness < STEEPEST)
