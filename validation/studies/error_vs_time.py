@@ -9,7 +9,6 @@ from typing import Any
 import mitsuba as mi
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.tools.study import Study
 from mrt_mitsuba.validation.tools.work_precision import Findings, describe, error_vs_time
 
@@ -28,24 +27,26 @@ Number = int | str  # of a scene of the report, or ``BOX``
 
 @dataclass(frozen=True)
 class Cost:
-    """How much to measure."""
+    """How much to measure; in full by default.
 
-    size: tuple[int, int]  #: of pictures, pixels
-    path_size: tuple[int, int]  #: of those that paths make
-    amounts: tuple[int, ...]  #: of ``aa``
-    most: int  #: ``aa`` of the reference
-    counts: tuple[int, ...]  #: of rays a pixel
-    path_spp: int  #: of the reference by paths
-    repeats: int
-    rounds: tuple[int, ...] = ()  #: rays a pixel where they go to noise
-    targets: tuple[str, ...] = ()
-    samplers: tuple[str, ...] = ()
-    sampler_counts: tuple[int, ...] = (4, 16)
+    References take even multiples of each amount, since odd ones share samples and with them errors.
+    """
+
+    size: tuple[int, int] = (400, 300)  #: of pictures, pixels
+    path_size: tuple[int, int] = (240, 180)  #: of those that paths make
+    amounts: tuple[int, ...] = (1, 2, 4, 8)  #: of ``aa``
+    most: int = 48  #: ``aa`` of the reference
+    counts: tuple[int, ...] = (1, 4, 16, 64)  #: of rays a pixel
+    path_spp: int = 2048  #: of the reference by paths
+    repeats: int = 5
+    rounds: tuple[int, ...] = (8, 16, 64)  #: rays a pixel where they go to noise
+    targets: tuple[str, ...] = ("4%", "2%", "1%")
+    samplers: tuple[str, ...] = SAMPLERS
+    sampler_counts: tuple[int, ...] = (4, 16, 64)
     lattices: tuple[str, ...] = ("report", "centered")  #: of pixels that are refined
     cold: bool = True  #: with every case's kernels compiled anew
 
 
-# the references: even multiples of each amount, since odd ones share samples and with them errors
 QUICK = Cost(
     size=(40, 30),
     path_size=(40, 30),
@@ -54,31 +55,19 @@ QUICK = Cost(
     counts=(1, 16),
     path_spp=256,
     repeats=1,
-)
-FULL = Cost(
-    size=(400, 300),
-    path_size=(240, 180),
-    amounts=(1, 2, 4, 8),
-    most=48,
-    counts=(1, 4, 16, 64),
-    path_spp=2048,
-    repeats=5,
-    rounds=(8, 16, 64),
-    targets=("4%", "2%", "1%"),
-    samplers=SAMPLERS,
-    sampler_counts=(4, 16, 64),
+    rounds=(),
+    targets=(),
+    samplers=(),
 )
 DOCS = Cost(
-    size=(400, 300),
     path_size=(160, 120),
-    amounts=(1, 2, 4, 8),
     most=16,
     counts=(),
     path_spp=1024,
     repeats=3,
     rounds=(16,),
     targets=("8%", "4%"),
-    samplers=SAMPLERS,
+    sampler_counts=(4, 16),
     lattices=("centered",),
     cold=False,
 )
@@ -107,7 +96,7 @@ class Trade:
     shared: Options = field(default_factory=dict)
     limits: Callable[[Findings], Sequence[Limit]] | None = None
 
-    def measure(self, cost: Cost, progress: Progress | None = None) -> Findings:
+    def measure(self, cost: Cost) -> Findings:
         """Render all cases."""
         return error_vs_time(
             self.scene,
@@ -116,13 +105,12 @@ class Trade:
             shared=self.shared,
             repeats=cost.repeats,
             cold=cost.cold,
-            progress=progress,
         )
 
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
-    cost = QUICK if quick else FULL
+    cost = QUICK if quick else Cost()
     jobs = [(name, number) for name in TRADES for number in ((0,) if quick else SCENES[name])]
     for name, number in study.each("Error against time", jobs):
         trade = TRADES[name](number, cost)
@@ -135,19 +123,20 @@ def run(study: Study, *, quick: bool) -> None:
         del trade, found  # what holds them is freed with them
 
 
-def choices(number: Number, cost: Cost = DOCS, progress: Progress | None = None) -> dict[str, Findings]:
+def choices(number: Number, cost: Cost) -> dict[str, Findings]:
     """Measure everything that a user can choose in a scene, by a title for each of the two truths.
 
     ``mrt_whitted`` and ``path`` converge to pictures of their own. The Cornell box has paths alone; scenes
-    whose highlights are so narrow that rare paths rule the error have none, unless ``cost`` is full.
+    whose highlights are so narrow that rare paths rule the error have none.
     """
-    titles = {"sampling": "rays as in the report (mrt_whitted)", "path": "light paths (path)"}
-    trades = ["path"] if number == BOX else ["sampling"]
-    if number in CALM or (cost is FULL and number != BOX):
-        trades = list(titles)
+    titles = {}
+    if number != BOX:
+        titles["sampling"] = "rays as in the report (mrt_whitted)"
+    if number == BOX or number in CALM:
+        titles["path"] = "light paths (path)"
     return {
-        f"{title_of(number)}: {titles[name]}": TRADES[name](number, cost).measure(cost, progress)
-        for name in trades
+        f"{title_of(number)}: {title}": TRADES[name](number, cost).measure(cost)
+        for name, title in titles.items()
     }
 
 

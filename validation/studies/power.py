@@ -214,45 +214,35 @@ def register(*variants: str) -> None:
         mi.register_bsdf("faulty", changed_bsdf(FAULTY))
 
 
-class Markdown(str):
-    """A text that notebooks show as such."""
-
-    def _repr_markdown_(self) -> str:
-        return self
+Row = dict[str, str]
 
 
-def statements() -> Markdown:
-    """A table of all laws, by the first lines of their docstrings."""
-    lines = ["| plugin | law | states |", "|---|---|---|"]
+def statements() -> list[Row]:
+    """A row for each law, which states it by the first line of its docstring, in Markdown."""
+    rows = []
     for name, kind in KINDS.items():
         for law in kind.laws.values():
             words = str(law.__doc__).splitlines()[0].replace("``", "`").replace("|", "\\|")
-            lines.append(f"| {name} | `{law.__name__}` | {words} |")
-    return Markdown("\n".join(lines))
+            rows.append({"plugin": name, "law": f"`{law.__name__}`", "states": words})
+    return rows
 
 
-def stated() -> Markdown:
-    """A table of all faults, and the least size that their laws are said to find."""
-    rows = [
+def stated() -> list[Row]:
+    """A row for each fault, with the least sizes that its law is said to find."""
+    return [
         row(name, fault, fault.quick, fault.full) for name, kind in KINDS.items() for fault in kind.faults
     ]
-    return Markdown("\n".join([HEAD, *rows]))
 
 
-HEAD = "| plugin | law | fault | quick | full |\n|---|---|---|---|---|"
-
-
-def row(name: str, fault: Fault, *least: float) -> str:
-    sizes = ["not found" if np.isinf(size) else f"{size:.1g}" for size in least]
-    return f"| {name} | `{fault.law}` | {fault.what} | {' | '.join(sizes)} |"
+def row(plugin: str, fault: Fault, quick: float, full: float) -> Row:
+    sizes = {"quick": quick, "full": full}
+    shown = {name: "not found" if np.isinf(size) else f"{size:.1g}" for name, size in sizes.items()}
+    return {"plugin": plugin, "law": f"`{fault.law}`", "fault": fault.what, **shown}
 
 
 if __name__ == "__main__":  # measures them
     register(runtime.SLOW, runtime.FAST)
-    print(HEAD)
     for name, kind in KINDS.items():
         for fault in kind.faults:
-            print(
-                row(name, fault, *(kind.least_found(fault, quick=quick) for quick in (True, False))),
-                flush=True,
-            )
+            least = (kind.least_found(fault, quick=quick) for quick in (True, False))
+            print(*row(name, fault, *least).values(), sep=" | ", flush=True)
