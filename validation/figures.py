@@ -14,6 +14,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.output.files import to_8bit
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.studies import error_vs_time, needs
+from mrt_mitsuba.validation.studies.honest import by_tenths
 from mrt_mitsuba.validation.studies.stability import curves
 from mrt_mitsuba.validation.tools import diagrams
 from mrt_mitsuba.validation.tools.compare import averaged
@@ -132,13 +133,7 @@ def tenths(scene: Any, *, seeds: int, truth_spp: int, spp: int = 64) -> tuple[np
         result = mrt.render(scene, integrator="path", aamode="noise", spp=spp, seed=seed, progress=Progress())
         stated.append(np.square(result.layers["error.Y"]))
         true.append(np.square(result.image - truth).mean(axis=-1) - noise)
-    order = np.array_split(np.argsort(stated, axis=None), 10)
-
-    def errors(squares: list[np.ndarray]) -> np.ndarray:
-        means = [np.ravel(squares)[part].mean() for part in order]
-        return np.sqrt(np.maximum(means, 1e-12))
-
-    return errors(stated), errors(true)
+    return by_tenths(np.array(stated), np.array(true))
 
 
 def stated_and_true(scenes: Mapping[str, Any], *, seeds: int = 8, truth_spp: int = 2048) -> Figure:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -15,13 +14,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.stats import gmean
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.validation.studies.filters import rmse
-from mrt_mitsuba.validation.tools.compare import averaged
+from mrt_mitsuba.validation.tools.compare import Array, averaged, compare
 from mrt_mitsuba.validation.tools.scenery import KINDS, LOCAL, SCENES, load, load_kind
-from mrt_mitsuba.validation.tools.study import Study, in_turns
+from mrt_mitsuba.validation.tools.study import Study, kernel_records, timed_in_turns
 
 TITLE = "The cost of an error, against the best sampler"
 SAMPLERS = ("independent", "stratified", "multijitter", "ldsampler")
@@ -31,7 +29,6 @@ UNIFORM = 128  # rays a pixel of ``SCENES``
 TIMED = ("calm", "texture", "gloss", "glass", "spot")  # kinds whose rays are timed
 WIDE = 1.15  # of a target: what misses it by more must warn
 
-Timed = tuple[Any, float]  # a picture, or a result, and its seconds
 Row = dict[str, Any]
 
 
@@ -48,36 +45,23 @@ def run(study: Study, *, quick: bool) -> None:
     own_scenes(study, tuple(SCENES), (96, 72), turns=5)
 
 
-def uniform(scene: Any, spp: int, seed: int) -> Timed:
-    """The picture of ``mi.render``, and its seconds."""
-    start = time.perf_counter()
-    picture = np.array(mi.render(scene, spp=spp, seed=seed))
-    return picture, time.perf_counter() - start
+def uniform(scene: Any, spp: int, seed: int) -> Array:
+    """The picture of ``mi.render``."""
+    return np.array(mi.render(scene, spp=spp, seed=seed))
 
 
-def adaptive(scene: Any, options: Row, seed: int) -> Timed:
-    """The result of ``mrt.render``, and its seconds."""
-    start = time.perf_counter()
-    result = mrt.render(scene, seed=seed, **options)
-    return result, time.perf_counter() - start
+def adaptive(scene: Any, options: Row, seed: int) -> mrt.Result:
+    """The result of ``mrt.render``."""
+    return mrt.render(scene, seed=seed, **options)
 
 
-def pictures(side: Sequence[Timed]) -> list[np.ndarray]:
-    return [np.asarray(getattr(result, "image", result)) for result, _ in side]
-
-
-def seconds(side: Sequence[Timed]) -> np.ndarray:
-    return np.array([seconds for _, seconds in side])
-
-
-def mean_rays(side: Sequence[Timed]) -> float:
-    return float(np.median([result.rounds[-1].spp for result, _ in side]))
+def mean_rays(results: Sequence[mrt.Result]) -> float:
+    return float(np.median([result.rounds[-1].spp for result in results]))
 
 
 def goals(study: Study, what: str, rows: Sequence[Row], mean: float, worst: float) -> None:
     """Hold the "time" of rows, and where it is "from" and "to", to goals."""
-    columns = [[row[name] for row in rows] for name in ("from", "time", "to")]
-    low, middle, high = np.exp(np.mean(np.log(columns), axis=1)).tolist()
+    low, middle, high = gmean([[row[name] for name in ("from", "time", "to")] for row in rows]).tolist()
     why = "rays that are saved, each a fifth dearer"
     study.goal(f"{what}: geometric mean", middle, mean, why, interval=(low, high))
     slowest = max(rows, key=lambda row: float(row["time"]))
@@ -116,30 +100,29 @@ def renders_to_an_error(study: Study, size: int, rays: int, *, turns: int, seeds
 def to_an_error(kind: str, size: int, rays: int, turns: int, seeds: int) -> tuple[Row, Row]:
     """What a render to an error takes, and how near to its target it ends."""
     scene = load_kind(kind, size)
-    converged = [uniform(scene, 4 * rays, 1000 + k)[0] for k in range(8)]
-    truth, spread = averaged(converged)
+    truth, spread = averaged([uniform(scene, 4 * rays, 1000 + k) for k in range(8)])
     noise = float(spread.mean())
 
-    def error(side: Sequence[Timed]) -> float:
-        squares = [rmse(picture, truth) ** 2 for picture in pictures(side)]
-        return math.sqrt(max(float(np.mean(squares)) - noise, 0.01 * noise))
+    def error(pictures: Sequence[Array]) -> float:
+        square = float(np.square(pictures - truth).mean())
+        return math.sqrt(max(square - noise, 0.01 * noise))
 
     target = error([uniform(scene, rays, 2000 + k) for k in range(4)])
     ladder = [round(step * rays) for step in LADDER]
-    sides: list[Callable[[int], Timed]] = [partial(adaptive, scene, {"target": target})]
+    ours = partial(adaptive, scene, {"target": target})
+    sides: list[Callable[[int], Any]] = [ours]
     for sampler in SAMPLERS:
         other = load_kind(kind, size, sampler)
         sides += [partial(uniform, other, count) for count in ladder]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mrt.MrtWarning)
-        in_turns(sides, 1)  # compiles
-        ours, *theirs = in_turns(sides, turns)
+        (results, seconds), *theirs = timed_in_turns(sides, turns)
     ratios: list[float] = []
     warned: list[bool] = []
     for seed in range(seeds):
         with warnings.catch_warnings(record=True) as messages:
             warnings.simplefilter("always", mrt.MrtWarning)
-            ratios.append(error([sides[0](seed)]) / target)
+            ratios.append(error([ours(seed).image]) / target)
         if ratios[-1] > WIDE:
             warned.append(bool(messages))
     aim: Row = {"scene": kind, "median": float(np.median(ratios)), "RMS": math.hypot(*ratios) / seeds**0.5}
@@ -148,13 +131,12 @@ def to_an_error(kind: str, size: int, rays: int, turns: int, seeds: int) -> tupl
     costs: list[Row] = []
     for k, sampler in enumerate(SAMPLERS):
         rungs = theirs[k * len(ladder) : (k + 1) * len(ladder)]
-        errors = [error(rung) for rung in rungs]
-        medians = [float(np.median(seconds(rung))) for rung in rungs]
+        errors = [error(pictures) for pictures, _ in rungs]
+        medians = [float(np.median(times)) for _, times in rungs]
         there = _at(reached, errors, medians)
-        low, middle, high = (
-            np.quantile(seconds(ours) / seconds(rungs[1]), (0.1, 0.5, 0.9)) * medians[1] / there
-        )
-        needed = mean_rays(ours) / _at(reached, errors, ladder)
+        slower = seconds / rungs[1][1] * medians[1] / there
+        low, middle, high = np.quantile(slower, (0.1, 0.5, 0.9))
+        needed = mean_rays(results) / _at(reached, errors, ladder)
         cost: Row = {"scene": kind, "sampler": sampler, "its seconds": there, "rays": needed}
         costs.append(cost | {"a ray": middle / needed, "time": middle, "from": low, "to": high})
     return min(costs, key=lambda cost: float(cost["its seconds"])), aim
@@ -166,24 +148,19 @@ def _at(error: float, errors: Sequence[float], figures: Sequence[float]) -> floa
     return float(np.exp(level + slope * math.log(error)))
 
 
-class Kernels(Progress):
-    """What Dr.Jit recorded of kernels, in the order of their launches."""
+def path_time(records: Sequence[Mapping[str, Any]]) -> float:
+    """The time of a ray in all rounds over that in the first, in which all pixels get the same rays.
 
-    def __init__(self) -> None:
-        self.records: list[Row] = []
-
-    def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
-        self.records += [dict(record) for record in records if record["type"] == dr.KernelType.JIT]
-
-    def path(self) -> float:
-        """The time of a ray in all rounds over that in the first, in which all pixels get the same rays."""
-        times: dict[Any, list[tuple[float, int]]] = {}
-        for record in self.records:
+    ``records``: of the kernels of a render.
+    """
+    times: dict[Any, list[tuple[float, int]]] = {}
+    for record in records:
+        if record["type"] == dr.KernelType.JIT:
             times.setdefault(record["hash"], []).append((record["execution_time"], record["size"]))
-        traced = max(times.values(), key=lambda launches: sum(time for time, _ in launches))
-        seconds, rays = np.sum(traced, axis=0)
-        first_seconds, first_rays = traced[0]
-        return float(seconds / rays / (first_seconds / first_rays))
+    traced = max(times.values(), key=lambda launches: sum(time for time, _ in launches))
+    seconds, rays = np.sum(traced, axis=0)
+    first_seconds, first_rays = traced[0]
+    return float(seconds / rays / (first_seconds / first_rays))
 
 
 def rays_alone(study: Study, size: int, rays: int, *, turns: int) -> None:
@@ -194,16 +171,13 @@ def rays_alone(study: Study, size: int, rays: int, *, turns: int) -> None:
         for rfilter in ("box", "gaussian"):
             scene = load_kind(kind, size, rfilter=rfilter)
             ours = partial(adaptive, scene, {"aamode": "noise", "spp": rays})
-            sides: list[Callable[[int], Timed]] = [ours, partial(uniform, scene, rays)]
-            in_turns(sides, 1)  # compiles
-            first, second = in_turns(sides, turns)
-            spent = mean_rays(first) / rays
-            kernels = Kernels()
-            mrt.render(scene, aamode="noise", spp=rays, progress=kernels)
-            row[f"{rfilter}: rays"] = spent
-            row[f"{rfilter}: a ray"] = float(np.median(seconds(first) / seconds(second))) / spent
-            row[f"{rfilter}: path"] = kernels.path()
-            row[f"{rfilter}: over"] = row[f"{rfilter}: a ray"] / row[f"{rfilter}: path"]
+            sides: list[Callable[[int], Any]] = [ours, partial(uniform, scene, rays)]
+            (results, seconds), (_, others) = timed_in_turns(sides, turns)
+            spent = mean_rays(results) / rays
+            ray = float(np.median(seconds / others)) / spent
+            path = path_time(kernel_records(partial(mrt.render, scene, aamode="noise", spp=rays)))
+            figures = {"rays": spent, "a ray": ray, "path": path, "over": ray / path}
+            row |= {f"{rfilter}: {name}": figure for name, figure in figures.items()}
         rows.append(row)
     note = (
         "aamode=noise over multijitter. Path: the time of a ray in its kernel over that of rays that go to "
@@ -235,7 +209,7 @@ def own_scenes(study: Study, names: Sequence[str], size: tuple[int, int], *, tur
     study.records("equal-error", title, rows, note, first=True)
     what = "time over that of the scene's own sampler"
     goals(study, f"{what}, scaled to equal error", rows, 0.36, 0.95)
-    mean = float(np.exp(np.mean([math.log(row["as it is"]) for row in rows])))
+    mean = gmean([row["as it is"] for row in rows])
     study.goal(f"{what}, as it is: geometric mean", mean, 0.5, "rays that are saved", interval=(mean, mean))
 
 
@@ -245,18 +219,16 @@ def own_scene(name: str, size: tuple[int, int], turns: int) -> Row:
     A squared error is the distance from the mean of all turns, which needs no truth.
     """
     scene = load(name, *size)
-    one, other = (uniform(scene, UNIFORM, seed)[0] for seed in (1000, 1001))
-    error = rmse(one, other) / math.sqrt(2)
-    same, _ = adaptive(scene, {"aa": 1, "aamode": "none", "spp": UNIFORM}, 1000)
-    sides: list[Callable[[int], Timed]] = [
-        partial(adaptive, scene, {"target": error}),
-        partial(uniform, scene, UNIFORM),
-    ]
-    in_turns(sides, 1)  # compiles
-    ours, theirs = in_turns(sides, turns)
-    squares = [np.var(pictures(side), axis=0, ddof=1).mean() for side in (ours, theirs)]
+    one, other = (uniform(scene, UNIFORM, seed) for seed in (1000, 1001))
+    error = compare(one, other).rmse / math.sqrt(2)
+    same = adaptive(scene, {"aa": 1, "aamode": "none", "spp": UNIFORM}, 1000)
+    ours = partial(adaptive, scene, {"target": error})
+    sides: list[Callable[[int], Any]] = [ours, partial(uniform, scene, UNIFORM)]
+    (results, seconds), (pictures, others) = timed_in_turns(sides, turns)
+    images = [result.image for result in results]
+    squares = [np.var(side, axis=0, ddof=1).mean() for side in (images, pictures)]
     worth = float(squares[0] / squares[1])
-    low, middle, high = np.quantile(seconds(ours) / seconds(theirs), (0.1, 0.5, 0.9)).tolist()
+    low, middle, high = np.quantile(seconds / others, (0.1, 0.5, 0.9)).tolist()
     row: Row = {"scene": name, "sampler": scene.sensors()[0].sampler().class_name()}
-    row |= {"off by": rmse(same.image, one) / error, "rays": worth * mean_rays(ours) / UNIFORM}
+    row |= {"off by": compare(same, one).rmse / error, "rays": worth * mean_rays(results) / UNIFORM}
     return row | {"as it is": middle, "time": worth * middle, "from": worth * low, "to": worth * high}

@@ -21,6 +21,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba import filters
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.tools.compare import compare
 from mrt_mitsuba.validation.tools.renders import load
 from mrt_mitsuba.validation.tools.scenery import AT_CENTRES
 from mrt_mitsuba.validation.tools.study import Study, Values
@@ -38,11 +39,6 @@ def run(study: Study, *, quick: bool) -> None:
     """Fill the study. What refining edges gives for its time is in ``error_vs_time``."""
     for part in study.each("Filters", (noise, depth_of_field)):
         part(study, quick=quick)
-
-
-def rmse(image: np.ndarray, truth: np.ndarray) -> float:
-    """The root of the mean squared difference."""
-    return float(np.sqrt(np.mean(np.square(image - truth, dtype=np.float64))))
 
 
 def noise(study: Study, *, quick: bool) -> None:
@@ -101,9 +97,9 @@ def depth_of_field(study: Study, *, quick: bool) -> None:
         nodes["sensor"] |= {"type": "thinlens", **lens}
         one, other = (mrt.render(nodes, **options, spp=spp, seed=seed).image for seed in (1, 100_001))
         truth = (one + other) / 2
-        errors = {f"RMSE, {mode}": rmse(picture, truth) for mode, picture in pictures.items()}
+        errors = {f"RMSE, {mode}": compare(picture, truth).rmse for mode, picture in pictures.items()}
         sharp_error, report, corrected = errors.values()
-        left = rmse(one, other) / 2
+        left = compare(one, other).rmse / 2
         worse = "a correction that is worse is none"
         where = f"scene {number}: "
         study.at_most(f"{where}RMSE of corrected / report", corrected / report, 1, worse)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.tools.compare import averaged
+from mrt_mitsuba.validation.tools.compare import Array, averaged
 from mrt_mitsuba.validation.tools.scenery import load_room
 from mrt_mitsuba.validation.tools.study import Study
 
@@ -46,71 +46,67 @@ def run(study: Study, *, quick: bool) -> None:
     cases = QUICK if quick else [(ball, lamp) for ball in BALLS for lamp in LAMPS]
     seeds, truth_rays = (10, 2**13) if quick else (100, 2**17)
     least, most = (0.7, 6) if quick else (0.9, 3.5)  # 6 of 10 hold once in a thousand times
-    rows: list[tuple[Any, ...]] = []
-    for ball, lamp in study.each("Renders to an error", cases):
-        rows.append((f"{ball}, {lamp} lamp", *_measured(scene(ball, lamp), seeds, truth_rays)))
-    study.table(
-        "honest",
-        f"Renders to the error of {SPP} rays, {SIZE}x{SIZE}: shares of {seeds} seeds",
-        (
-            "scene",
-            "held or doubted",
-            "doubted",
-            "mean off, %",
-            "±",
-            "true / stated of pixels: least",
-            "largest",
-            "p of pairs: test",
-        ),
-        rows,
-        "Pixels: the root mean squares of tenths sorted by the stated error, where nothing is in doubt.",
-        first=True,
-    )
+    rows = [
+        {"scene": f"{ball}, {lamp} lamp", **measured(scene(ball, lamp), seeds, truth_rays)}
+        for ball, lamp in study.each("Renders to an error", cases)
+    ]
+    title = f"Renders to the error of {SPP} rays, {SIZE}x{SIZE}: shares of {seeds} seeds"
+    note = "Pixels: the root mean squares of tenths sorted by the stated error, where nothing is in doubt."
+    study.records("honest", title, rows, note, first=True)
+    figures = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     why = "an interval of 95 %, and what the picture to compare with has of noise"
-    study.at_least(
-        "stated errors that hold, or are doubted: worst scene", min(r[1] for r in rows), least, why
-    )
-    calm = [r[2] for r in rows if r[0].startswith(CALM) and "small" not in r[0]]
+    what = "stated errors that hold, or are doubted: worst scene"
+    study.at_least(what, figures["held or doubted"].min(), least, why)
+    calm = [row["doubted"] for row in rows if row["scene"].startswith(CALM) and "small" not in row["scene"]]
     study.at_most("calm scenes that are doubted", max(calm), 0.02, "nothing there is rare")
     pairs = "p-values of pairs are uniform: least p of Kolmogorov and Smirnov's test"
-    study.at_least(pairs, min(r[7] for r in rows), 0.001, "the least of 21 is that small once in 50 times")
-    off = max(abs(r[3]) / r[4] for r in rows)
+    why = "the least of 21 is that small once in 50 times"
+    study.at_least(pairs, figures["p of pairs: test"].min(), 0.001, why)
+    off = abs(figures["mean off, %"] / figures["±"]).max()
     why = "the largest of 21 is 3.5 once in a hundred times"
     study.at_most("means off, in standard errors", off, most, why)
 
 
-def _measured(scene: Any, seeds: int, truth_rays: int) -> tuple[float, ...]:
-    once = truth_rays // 16
-    pictures = [np.array(mi.render(scene, spp=once, seed=10_000 + k)) for k in range(16)]
+def measured(scene: Any, seeds: int, truth_rays: int) -> dict[str, Any]:
+    """The columns of a scene's row but its name, from a render to an error for each seed."""
+    pictures = [np.array(mi.render(scene, spp=truth_rays // 16, seed=10_000 + k)) for k in range(16)]
     truth, noise = averaged(pictures)
-    own = np.std([p.mean() for p in pictures], ddof=1) / len(pictures) ** 0.5  # of its mean
-    rounding = (1e-4 * truth.mean()) ** 2  # of many rays of one value, in single precision
-    target = float(np.sqrt(noise.mean() * truth_rays / SPP))
-    held, doubted, means, stated, true, p = 0, 0, [], [], [], []
-    last = None
-    for seed in range(seeds):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", mrt.MrtWarning)
-            result = mrt.render(scene, target=target, maxspp=512, seed=seed)
-        error, squares = result.error, np.square(result.image - truth).mean(-1) - noise
-        assert error is not None  # there was a target
-        if seed % 2:
-            p.append(mrt.compare(result, last).p_value)
-        last, doubt = result, error.high == np.inf
-        held += doubt or error.low**2 <= squares.mean() <= error.high**2
-        doubted += doubt
-        means.append(result.image.mean(dtype=np.float64))
-        if not doubt:
-            stated.append(np.square(result.layers["error.Y"]) + rounding)
-            true.append(squares + rounding)
-    ratios = [np.nan]
-    if stated:
-        order = np.array_split(np.argsort(stated, axis=None), 10)
-        ratios = [np.mean(np.ravel(true)[i]) / np.mean(np.ravel(stated)[i]) for i in order]
-        ratios = [float(np.sqrt(max(ratio, 0))) for ratio in ratios]
     mean = truth.mean()
-    spread = float(np.hypot(np.std(means, ddof=1) / seeds**0.5, own))
-    off = 100 * (np.mean(means) / mean - 1)
-    uniform = float(stats.kstest(p, "uniform").pvalue)
-    rest = 100 * spread / float(mean), min(ratios), max(ratios), uniform
-    return held / seeds, doubted / seeds, float(off), *rest
+    rounding = (1e-4 * mean) ** 2  # of many rays of one value, in single precision
+    target = float(np.sqrt(noise.mean() * truth_rays / SPP))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mrt.MrtWarning)
+        results = [mrt.render(scene, target=target, maxspp=512, seed=seed) for seed in range(seeds)]
+    squares = np.square([result.image for result in results] - truth).mean(axis=-1) - noise  # [seeds, H, W]
+    overall = squares.mean(axis=(1, 2))
+    low, high = np.array([(result.error.low, result.error.high) for result in results if result.error]).T
+    doubted = np.isinf(high)
+    held = doubted | (low**2 <= overall) & (overall <= high**2)
+    ratios = np.array([np.nan])
+    if not doubted.all():
+        stated = np.square([result.layers["error.Y"] for result in results])
+        stated_tenths, true_tenths = by_tenths(stated[~doubted] + rounding, squares[~doubted] + rounding)
+        ratios = true_tenths / stated_tenths
+    means = [result.image.mean(dtype=np.float64) for result in results]
+    spread = np.hypot(stats.sem(means), stats.sem([picture.mean() for picture in pictures]))
+    p_values = [mrt.compare(*pair).p_value for pair in zip(results[1::2], results[::2], strict=True)]
+    return {
+        "held or doubted": held.mean(),
+        "doubted": doubted.mean(),
+        "mean off, %": 100 * (np.mean(means) / mean - 1),
+        "±": 100 * spread / mean,
+        "true / stated of pixels: least": ratios.min(),
+        "largest": ratios.max(),
+        "p of pairs: test": stats.kstest(p_values, "uniform").pvalue,
+    }
+
+
+def by_tenths(stated: Array, true: Array) -> tuple[Array, Array]:
+    """The roots of the means of squared errors, in tenths of them sorted by the stated ones. [10] each"""
+    order = np.array_split(np.argsort(stated, axis=None), 10)
+
+    def errors(squares: Array) -> Array:
+        means = [np.ravel(squares)[part].mean() for part in order]
+        return np.sqrt(np.maximum(means, 1e-12))
+
+    return errors(stated), errors(true)

@@ -6,8 +6,7 @@ with that and as many rays in every pixel as edges get.
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -17,11 +16,10 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.output import LAYERS
-from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rendering.api import Result
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.study import Study, Values, in_turns, operations
+from mrt_mitsuba.validation.tools.study import Study, Values, operations, timed_in_turns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,23 +41,6 @@ TITLES = {
 
 REFINED: Values = {"progress": Progress(), "aa": 4, "aamode": "sobel", "lattice": "report"}
 
-Figures = dict[str, dict[str, float]]  # of ``MEASURES``, by the way
-
-
-def general(plan: KernelPlan, facts: SceneFacts) -> KernelPlan:
-    """A plan that leaves out no code that a kernel may hold."""
-    return replace(
-        plan,
-        mirrors=True,
-        lobes=tuple(name for name, _ in facts.lobes),
-        bvh=True,
-        textures=True,
-        shading_frames=True,
-        tangents=True,
-        emission=True,
-        two_sided=True,
-    )
-
 
 def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
     """A scene, and the same with kernels that leave nothing out."""
@@ -69,13 +50,23 @@ def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
     whole = mi.load_dict(nodes)
     integrator = whole.integrator()
     data = integrator.prepare(whole)
-    kernels = general(data.plan, data.facts)
+    kernels = replace(
+        data.plan,
+        mirrors=True,
+        lobes=tuple(name for name, _ in data.facts.lobes),
+        bvh=True,
+        textures=True,
+        shading_frames=True,
+        tangents=True,
+        emission=True,
+        two_sided=True,
+    )
     integrator.kernel_plan = lambda facts: kernels
     return planned, whole
 
 
-def measure(number: int, size: tuple[int, int], repeats: int) -> tuple[Figures, Result]:
-    """The figures of each way to render a scene, with edges refined, and a result as planned."""
+def measure(number: int, size: tuple[int, int], repeats: int) -> Values:
+    """The row of a scene with edges refined: figures as planned, and factors of the other ways."""
     planned, whole = scenes_of(number, size)
     general_way = REFINED | {"layers": "all"}
     renders = {
@@ -95,10 +86,14 @@ def measure(number: int, size: tuple[int, int], repeats: int) -> tuple[Figures, 
     def render_by(way: str, turn: int) -> Result:
         return renders[way]()
 
-    results = in_turns([partial(render_by, way) for way in renders], repeats)
-    for way, runs in zip(renders, results, strict=True):
-        figures[way]["seconds"] = statistics.median(r.timings.total - r.timings.load for r in runs)
-    return figures, results[0][0]
+    turns = timed_in_turns([partial(render_by, way) for way in renders], repeats)
+    for way, (_, seconds) in zip(renders, turns, strict=True):
+        figures[way]["seconds"] = float(np.median(seconds))
+    own = figures[PLANNED]
+    times = {f"{name}: times as many": figures[way][name] / own[name] for name, way in MEASURES.items()}
+    (result, *_), _ = turns[0]
+    left_out = ", ".join(what for what, _ in result.plan.left_out if what not in LAYERS)
+    return {"scene": number, **own, **times, "left out": left_out}
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -109,52 +104,47 @@ def run(study: Study, *, quick: bool) -> None:
 
 def show(study: Study, size: tuple[int, int], scenes: Sequence[int], repeats: int) -> None:
     """Add the bars and the table of scenes to a study."""
-    found = {}
     rows = []
     for number in study.each(TITLE, scenes):
-        found[number], result = measure(number, size, repeats)
-        planned = found[number][PLANNED]
-        times = {
-            f"{name}: times as many": found[number][way][name] / planned[name]
-            for name, way in MEASURES.items()
-        }
-        rows.append({"scene": number, **planned, **times, "left out": _left_out(result)})
+        row = measure(number, size, repeats)
+        rows.append(row)
         for name in ("rays", "operations"):
             why = "what is left out costs nothing; least fault: it stays"
-            times_as_many = found[number][MEASURES[name]][name] / planned[name]
+            times_as_many = row[f"{name}: times as many"]
             study.at_least(f"scene {number}: {name} without a plan / with it", times_as_many, 1, why)
     caption = (
         "Blue: as planned, with the figure itself on it. Orange: where nothing is left out: all code in "
         "the kernels, all layers, and (but for launches) as many rays in every pixel as edges get."
     )
     for name, title in TITLES.items():
-        study.picture(f"savings {name}", title, savings(name, found), caption if name == "rays" else "")
+        study.picture(f"savings {name}", title, savings(name, rows), caption if name == "rays" else "")
     columns = "{}x{} pixels; operations: of the largest kernel, in Dr.Jit's own code".format(*size)
     study.records("savings", "What each scene goes without", rows, columns, first=True)
 
 
-def _left_out(result: Result) -> str:
-    return ", ".join(what for what, _ in result.plan.left_out if what not in LAYERS)
-
-
-def savings(name: str, found: Mapping[int, Figures]) -> Figure:
-    """Draw how many times as much of a measure scenes cost where nothing is left out, a bar for each."""
+def savings(name: str, rows: Sequence[Values]) -> Figure:
+    """Draw how many times as much of a measure scenes cost where nothing is left out, a bar for each row."""
     from matplotlib.ticker import EngFormatter
 
-    planned = np.array([figures[PLANNED][name] for figures in found.values()])
-    times = np.array([figures[MEASURES[name]][name] for figures in found.values()]) / planned
+    times = np.array([row[f"{name}: times as many"] for row in rows])
     most = max(times.max(), 1.2)
-    rows = np.arange(len(found))
+    places = np.arange(len(rows))
     quantity = EngFormatter("s" if name == "seconds" else "")
-    drawn, axes = diagrams.panel(TITLES[name], 4.6, 0.3 * len(found) + 1)
-    axes.barh(rows, times, height=0.7, color="#f2b98f")
-    axes.barh(rows, np.ones(len(rows)), height=0.7, color=diagrams.COLORS[0])
-    shown: Values = {"va": "center", "fontsize": diagrams.LABELS}
-    for row, (own, factor) in enumerate(zip(planned, times, strict=True)):
-        axes.text(max(factor, 1) + 0.02 * most, row, f"× {factor:.2f}", color=diagrams.TEXT, **shown)
-        axes.text(0.02 * most, row, quantity(float(f"{own:.3g}")), color="white", **shown)
+    drawn, axes = diagrams.panel(TITLES[name], 4.6, 0.3 * len(rows) + 1)
+    bars = axes.barh(places, np.maximum(times, 1), height=0.7, color="#f2b98f")
+    axes.bar_label(
+        bars,
+        [f"× {factor:.2f}" for factor in times],
+        padding=3,
+        color=diagrams.TEXT,
+        fontsize=diagrams.LABELS,
+    )
+    axes.barh(places, np.ones(len(rows)), height=0.7, color=diagrams.COLORS[0])
+    for place, row in enumerate(rows):
+        own = quantity(float(f"{row[name]:.3g}"))
+        axes.text(0.02 * most, place, own, color="white", va="center", fontsize=diagrams.LABELS)
     axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, 1.25 * most))
-    axes.set_yticks(rows, [f"scene {number}" for number in found])
+    axes.set_yticks(places, [f"scene {row['scene']}" for row in rows])
     axes.tick_params(axis="y", length=0)
     axes.set_xlabel("times as much as planned", **diagrams.WORDS)
     axes.spines["left"].set_visible(False)

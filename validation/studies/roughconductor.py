@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import os
-import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +21,7 @@ from mrt_mitsuba.validation.oracles.reference import smith_g1
 from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, lobe_pairs, relative_error
 from mrt_mitsuba.validation.tools.compare import compare, p_values
 from mrt_mitsuba.validation.tools.scenery import ball_scene
-from mrt_mitsuba.validation.tools.study import Study, Values, in_turns, timed
+from mrt_mitsuba.validation.tools.study import Study, Values, timed_in_turns
 
 TITLE = "The BSDF against Mitsuba's roughconductor"
 
@@ -160,12 +159,10 @@ def compare_roughconductor(
     def render(index: int, turn: int) -> NDArray[np.float32]:
         return np.array(mi.render(scenes[index], spp=spp, seed=seed + 1 + index + 2 * turn))
 
-    sides = [partial(timed, partial(render, i)) for i in range(2)]
-    in_turns(sides, 1)  # compiles
-    runs = in_turns(sides, renders)
-    pictures = [[picture for picture, _ in side] for side in runs]
-    seconds = [statistics.median(time for _, time in side) for side in runs]
-    first, second = np.mean(pictures, axis=1)
+    runs = timed_in_turns([partial(render, i) for i in range(2)], renders)
+    pictures = np.array([side for side, _ in runs])  # [2, renders, H, W, 3]
+    seconds, other_seconds = (float(np.median(times)) for _, times in runs)
+    first, second = pictures.mean(axis=1, dtype=np.float64)
     # Drawn from D, whose density is the same in both. A path that rounding sends past the other side of an
     # edge goes on differently; anything else would show in most pixels of the ball
     plain = (ball_scene(bsdf(alpha, visible=False), size=size) for bsdf in (ours, theirs))
@@ -174,14 +171,13 @@ def compare_roughconductor(
     errors = {
         **compare_pointwise(alpha, count=pairs),
         RELATIVE: compare(first, second).rel_mse ** 0.5,
-        P_VALUE: min(p_values(*map(np.stack, pictures)).values()),
+        P_VALUE: min(p_values(*pictures).values()),
         SAME: float(differ.mean()),
     }
-    timings = {"ours": seconds[0], "theirs": seconds[1], "ratio": seconds[0] / seconds[1]}
-    images = {"ours": first, "theirs": second, "difference": first - second}
-    return RoughconductorComparison(
-        alpha, errors, timings, {n: np.float32(i) for n, i in images.items()}, spp * renders
-    )
+    timings = {"ours": seconds, "theirs": other_seconds, "ratio": seconds / other_seconds}
+    first, second, difference = np.array([first, second, first - second], np.float32)
+    images = {"ours": first, "theirs": second, "difference": difference}
+    return RoughconductorComparison(alpha, errors, timings, images, spp * renders)
 
 
 def rendered(study: Study, *, quick: bool) -> None:

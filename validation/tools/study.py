@@ -216,15 +216,31 @@ def ratio(run: Run, other: Run, *, repeats: int) -> dict[str, float]:
     return ratio_of(*in_turns(sides, repeats))
 
 
-def operations(render: Run) -> list[int]:
-    """The length of the code of each distinct kernel of a ``mrt.render``."""
-    lengths = {}  # by the hash of the code
+def timed_in_turns(sides: Sequence[Callable[[int], Item]], turns: int) -> list[tuple[list[Item], np.ndarray]]:
+    """The results of each side, see ``in_turns``, and their seconds [turns].
+
+    Each side runs once before, which compiles its kernels.
+    """
+    in_turns(sides, 1)
+    runs = in_turns([partial(timed, side) for side in sides], turns)
+    return [([result for result, _ in run], np.array([seconds for _, seconds in run])) for run in runs]
+
+
+def kernel_records(render: Run) -> list[Mapping[str, Any]]:
+    """What Dr.Jit recorded of the kernels of a ``mrt.render``, in the order of their launches."""
+    found: list[Mapping[str, Any]] = []
 
     class Watch(Progress):
         def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
-            lengths.update({r["hash"]: r["operation_count"] for r in records if r.get("operation_count")})
+            found.extend(records)
 
     render(progress=Watch())
+    return found
+
+
+def operations(render: Run) -> list[int]:
+    """The length of the code of each distinct kernel of a ``mrt.render``."""
+    lengths = {r["hash"]: r["operation_count"] for r in kernel_records(render) if r.get("operation_count")}
     return list(lengths.values())
 
 
