@@ -157,8 +157,8 @@ def needs_turn(scene: mi.Scene, integrator: mi.Integrator) -> bool:
     if not all(plugins.is_known(each) for each in inside if isinstance(each, mi.Integrator)):
         return False
     shapes = scene.shapes()
-    materials = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in shapes)}
-    direct = (*scene.emitters(), *shapes, *materials.values(), *scene.sensors())
+    materials = [shape.bsdf() for shape in shapes]
+    direct = (*scene.emitters(), *shapes, *materials, *scene.sensors())
     # A texture, say, in a material of Mitsuba's
     return any(map(of_this_package, direct)) or any(map(of_this_package, mi.traverse(scene).hierarchy))
 
@@ -216,7 +216,7 @@ def update_in_turn(update: Function, /, *args: object, **given: object) -> list[
 class TwoThreads:
     """Lets Dr.Jit have two threads at least: with one, Mitsuba waits for the EXR files it reads for ever.
 
-    Blocks may overlap: the first that enters sets them, and the last that leaves takes them back.
+    Blocks may overlap: one that needs a second thread sets it, and the last that leaves takes it back.
     """
 
     def __init__(self) -> None:
@@ -230,17 +230,18 @@ class TwoThreads:
 
     def __enter__(self) -> None:
         with self._lock:
-            if self._blocks == 0:
-                self._raised = dr.thread_count() == 1
-            if self._raised and dr.thread_count() == 1:
-                dr.set_thread_count(2)
             self._blocks += 1
+            if dr.thread_count() == 1:
+                self._raised = True
+                dr.set_thread_count(2)
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
             self._blocks -= 1
-            if self._blocks == 0 and self._raised and dr.thread_count() == 2:
-                dr.set_thread_count(1)
+            if self._blocks == 0 and self._raised:
+                self._raised = False
+                if dr.thread_count() == 2:
+                    dr.set_thread_count(1)
 
 
 two_threads = TwoThreads()
