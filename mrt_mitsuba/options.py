@@ -112,8 +112,7 @@ def _target(value: Any) -> Target | tuple[float, ...]:
     """A target, or the point of an OBJ file that the camera looks at."""
     if isinstance(value, Iterable) and not isinstance(value, str):
         return _point(value)
-    target = Target.of(value)
-    return _only(target, target.positive)
+    return Target.of(value)
 
 
 def _target_in(text: str) -> str | tuple[float, ...]:

@@ -20,11 +20,16 @@ def plain(text: str) -> str:
 class Target:
     """An RMSE to the converged picture, linear: a number, or a share of the picture's mean luminance.
 
-    ``str()`` writes it as an option takes it: "0.01" or "2%".
+    ``str()`` writes it as an option takes it: "0.01" or "2%". Raises ``ValueError`` for a value that cannot
+    be reached: zero, negative or not finite.
     """
 
     value: float  #: of a relative target the share, 0.02 for 2 %
     relative: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.value < math.inf:
+            raise ValueError(f"{self.value} cannot be reached: a target is finite and more than 0")
 
     @classmethod
     def of(cls, value: object) -> Target:
@@ -41,11 +46,6 @@ class Target:
         number = float(plain(value.removesuffix(PERCENT)))
         relative = value.endswith(PERCENT)
         return cls(number / 100 if relative else number, relative)
-
-    @property
-    def positive(self) -> bool:
-        """Whether it can be reached at all: finite, and more than zero."""
-        return 0 < self.value < math.inf
 
     @property
     def plain(self) -> float | str:

@@ -116,8 +116,12 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
         raise OutputError(f"the picture has shape {planes['RGB'].shape}; expected [H, W, 3]")
     for name, array in layers.items():
         array = np.atleast_3d(np.asarray(array, np.float32))
-        letters = LAYERS[name].letters if name in LAYERS else "RGB" if array.shape[2] == 3 else "Y"
-        names = [name] if "." in name or name == "A" else [f"{name}.{letter}" for letter in letters]
+        letters = "RGB" if array.shape[2] == 3 else "Y"
+        if name in LAYERS:
+            letters = LAYERS[name].letters
+        names = [f"{name}.{letter}" for letter in letters]
+        if "." in name or name == "A":  # a channel by itself
+            names = [name]
         if array.shape != (*planes["RGB"].shape[:2], len(names)):
             raise OutputError(f"layer {name} of shape {array.shape} is no {' '.join(names)} of the picture")
         planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}

@@ -191,9 +191,7 @@ def _goal(props: mi.Properties) -> Goal:
 def _target(props: mi.Properties) -> Target:
     value = props.get("target", 0.01)
     with suppress(TypeError, ValueError):
-        target = Target.of(value)
-        if target.positive:
-            return target
+        return Target.of(value)
     raise ParameterError(
         f'mrt_adaptive: "target" is {value!r}, but must be a number > 0, or a percentage such as "2%"'
     )

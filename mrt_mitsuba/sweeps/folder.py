@@ -58,9 +58,8 @@ def _locked(folder: str) -> Iterator[bool]:
     Raises ``OutputError`` where another process has the lock.
     """
     path = os.path.join(folder, LOCK)
-    file: int | None = None
-    there = False
-    while not there:
+    alone = True
+    while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -69,25 +68,22 @@ def _locked(folder: str) -> Iterator[bool]:
             reason = "another sweep works there; wait for it, or choose another folder"
             raise OutputError(f"cannot write to the folder {folder}: {reason}") from None
         except OSError:
-            os.close(file)
-            file = None
+            alone = False
+        if os.path.exists(path) and os.path.samestat(os.stat(path), os.fstat(file)):
             break
-        there = os.path.exists(path) and os.path.samestat(os.stat(path), os.fstat(file))
-        if not there:  # the sweep before has just removed it
-            os.close(file)
+        os.close(file)  # the sweep before has just removed it
     unfinished.add(path)
-    if file is None:
-        text = f"the file system of {folder} has no locks: see to it that no other sweep writes there"
-        warn(text)
     try:
-        yield file is not None
+        if not alone:
+            warn(f"the file system of {folder} has no locks: see to it that no other sweep writes there")
+        yield alone
     finally:
         with contextlib.suppress(OSError):
             os.unlink(path)  # while it is locked: who waits for it sees that it is no longer in its place
         unfinished.discard(path)
-        if file is not None:
+        with contextlib.suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_UN)  # also for a child process that has the file open
-            os.close(file)
+        os.close(file)
 
 
 def read_note(path: str | Path) -> Facts:
