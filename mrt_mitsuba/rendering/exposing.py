@@ -277,32 +277,36 @@ class Exposer:
         ours = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
         self.names = self.own + ours
 
-    def lattice(self, places: Places, seed: Any) -> LatticeStarts:
-        """Where rays start at the samples of a lattice; ``seed``: a number, or an array of one."""
+    def starts(self, places: Places, seed: Any) -> LatticeStarts | SceneStarts:
+        """Where the rays of a pass start; ``seed``: a number, or an array of one."""
         shader = self.shader
+        if self.film is not None:
+            return SceneStarts(self.film, seed, self.film.rays_near(places.size))
         random = shader.random or mi.is_spectral or shader.sensor.needs_aperture_sample()
         sampler = ray_sampler(places.size) if random else None
         return LatticeStarts(places, shader.width, shader.height, seed, sampler)
 
     def average(
         self,
-        groups: Groups,
-        starts: LatticeStarts,
+        places: Places,
+        seed: int,
+        pixels: Any,
         layers: Mapping[str, np.ndarray],
         chosen: np.ndarray | None,
         advance: Advance,
     ) -> None:
-        """Trace the rays of a lattice, and write the mean of each pixel into layers, [pixels, channels] each;
-        into layers of the first hit, what its first ray hit.
+        """Trace the rays of a lattice in pixels, and write the mean of each pixel into layers, [pixels,
+        channels] each; into layers of the first hit, what its first ray hit.
 
         ``chosen``: the rows of the pixels in the layers, whose means of earlier samples are averaged with the
         new ones; None: every row is new. The results do not depend on how memory cuts the rays into
         wavefronts.
         """
         channels = len(self.names)
-        known = starts.places.first
-        new = starts.places.count
-        for part, _, _, values in self._wavefronts(groups, starts, channels):
+        known = places.first
+        new = places.count
+        groups = Groups(places.size, pixels)
+        for part, _, _, values in self._wavefronts(groups, self.starts(places, seed), channels):
             rows = part if chosen is None else chosen[part]
             for name, planes in values.items():
                 first = TABLE[name].source == FIRST_HIT

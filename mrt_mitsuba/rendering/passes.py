@@ -17,7 +17,7 @@ from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
 from mrt_mitsuba.output.layers import TABLE
 from mrt_mitsuba.rays.film import Region
-from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, SceneStarts, Stack, widened
+from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Stack, widened
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
 from mrt_mitsuba.rendering.settings import DETECTORS
@@ -91,9 +91,8 @@ class Passes:
             row, column = np.divmod(inside, np.uint32(seen.width))
             pixels = (row + np.uint32(seen.y)) * np.uint32(width) + column + np.uint32(seen.x)
         layers = {name: self._layer(name).reshape(count, -1) for name in exposer.layers}
-        starts = exposer.lattice(places, seed)
         with self._job.stage(step.name, len(pixels)) as advance:
-            exposer.average(Groups(places.size, pixels), starts, layers, edge, advance)
+            exposer.average(places, seed, pixels, layers, edge, advance)
         if "square" in step.layers:
             variance = np.maximum(self.layers.pop("square") - self.layers["image"] ** 2, 0)
             self.layers["variance"] = variance / (places.size - 1)  # of the means
@@ -113,7 +112,7 @@ class Passes:
             seed += 1
         chosen = np.pad(marked, film.border).reshape(1, -1)
         pixels = np.flatnonzero(widened(film, chosen)[0])
-        starts = SceneStarts(film, seed, rays)
+        starts = exposer.starts(step.places, seed)
         moments = "square" in step.layers
         with self._job.stage(step.name, len(pixels) * rays) as advance:
             exposed = exposer.expose(Groups(rays, pixels), starts, moments=moments, advance=advance)

@@ -147,7 +147,7 @@ class Prepared:
         """The channels along one ray of each pixel."""
         exposer = self._exposer
         plan = self._made.plan
-        starts = exposer.lattice(plan.passes[0].places, seed)
+        starts = exposer.starts(plan.passes[0].places, seed)
         pixel = dr.arange(mi.UInt32, plan.width * plan.height)
         _, values = exposer.trace(pixel, mi.UInt32(0), starts)
         (channels,) = values.values()
