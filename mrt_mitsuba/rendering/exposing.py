@@ -32,8 +32,8 @@ from mrt_mitsuba.rendering.shading import RayValues, Shader
 
 log = logging.getLogger(__name__)
 
-# Of rays, by layer and channel: mi.Float, in scalar variants np.ndarray
-Values = dict[str, list[Any]]
+# Of rays, by channel: mi.Float, in scalar variants np.ndarray
+Values = list[Any]
 OWN = "own:"  # begins what is no layer's name: the channels of the film and the integrator
 
 
@@ -262,8 +262,9 @@ def _over_rays(plane: Any, size: int, first: bool) -> np.ndarray:
 class Exposer:
     """A shader that exposes pixels of a lattice, or of a film.
 
-    ``layers``: by name, those to expose; of a film next to the picture. ``own``: names of the channels of a
-    film, R, G and B first, and of its integrator. ``names``: of all channels, the own ones first.
+    ``own``: names of the channels of a film, R, G and B first, and of its integrator. ``names``: of all
+    channels, the own ones first. ``planes``: the layers to expose, of a film next to its picture, each with
+    its places among the channels.
     """
 
     def __init__(self, job: Job, shader: Shader, step: Pass) -> None:
@@ -271,11 +272,15 @@ class Exposer:
         self.job = job
         self.shader = shader
         self.film: Any = film  #: None for a lattice
-        known = ("image", "square") if film else ()  # to a film by itself
-        self.layers = [name for name in TABLE if name in step.layers and name not in known]
         self.own = [*"RGB", *"A" * film.alpha, *film.bands, *shader.aovs] if film else []
-        ours = [f"{name}.{letter}" for name in self.layers for letter in TABLE[name].letters]
-        self.names = self.own + ours
+        self.names = list(self.own)
+        self.planes: dict[str, slice] = {}
+        known = ("image", "square") if film else ()  # to a film by itself
+        for name, layer in TABLE.items():
+            if name in step.layers and name not in known:
+                start = len(self.names)
+                self.names += [f"{name}.{letter}" for letter in layer.letters]
+                self.planes[name] = slice(start, len(self.names))
 
     def starts(self, places: Places, seed: Any) -> LatticeStarts | SceneStarts:
         """Where the rays of a pass start; ``seed``: a number, or an array of one."""
@@ -308,10 +313,10 @@ class Exposer:
         groups = Groups(places.size, pixels)
         for part, _, _, values in self._wavefronts(groups, self.starts(places, seed), channels):
             rows = part if chosen is None else chosen[part]
-            for name, planes in values.items():
+            for name, planes in self.planes.items():
                 first = TABLE[name].source == FIRST_HIT
-                sums = np.broadcast_arrays(*(_over_rays(plane, groups.size, first) for plane in planes))
-                means = np.stack(sums, -1).astype(np.float32, copy=False)
+                sums = [_over_rays(plane, groups.size, first) for plane in values[planes]]
+                means = np.stack(np.broadcast_arrays(*sums), -1).astype(np.float32, copy=False)
                 means *= np.float32(1 if first else 1 / groups.size)
                 layer = layers[name]
                 if chosen is not None:
@@ -337,8 +342,7 @@ class Exposer:
         rays = groups.rays_of(pictures * film.pixels).reshape(pictures, -1)
         canvas = Canvas(film, rays, len(self.names), moments=moments)
         for _, some, place, values in self._wavefronts(groups, starts, 2 * len(self.names)):
-            planes = [plane for channels in values.values() for plane in channels]
-            canvas.put(place, planes, some.rays_of(rays.size))
+            canvas.put(place, values, some.rays_of(rays.size))
             advance(some.rays)
         return canvas
 
@@ -365,25 +369,24 @@ class Exposer:
                     place = None  # a box takes all rays of a pixel alike
                 dr.eval(place, values)
             self.job.rays["primary"] += some.rays
-            for name, planes in values.items():
-                kind = TABLE[name].counts if name in TABLE else ""
-                if kind:
-                    self.job.rays[kind] += round(float(np.sum(np.asarray(planes[0]), dtype=np.float64)))
+            for name, planes in self.planes.items():
+                if TABLE[name].counts:
+                    count = np.sum(np.asarray(values[planes.start]), dtype=np.float64)
+                    self.job.rays[TABLE[name].counts] += round(float(count))
             yield part, some, place, values
 
     def _one_by_one(self, groups: Groups, starts: Starts) -> tuple[np.ndarray, Values]:
         """Trace rays in a loop, as scalar variants do."""
         places = list[tuple[float, float]]()
-        values = dict[str, list[Any]]()
+        values = list[Values]()
         for entry, pixel in enumerate(groups.pixels):
             count, first = (1, 0) if groups.shares is None else groups.shares[:, entry].tolist()
             for number in range(first, first + groups.size * count):
                 place, traced = self.trace(int(pixel), number, starts, groups.before)
                 heed()
                 places.append((0, 0) if place is None else (place.x, place.y))
-                for name, channels in traced.items():
-                    values.setdefault(name, []).append(channels)
-        return np.array(places).T, {name: list(np.array(planes).T) for name, planes in values.items()}
+                values.append(traced)
+        return np.array(places).T, list(np.array(values).T)
 
     def trace(
         self, pixel: mi.UInt32, number: mi.UInt32, starts: Starts, before: int = 0
@@ -391,9 +394,9 @@ class Exposer:
         """Trace a ray, or one in each lane, for its place on the film, and its values."""
         start = starts.start(pixel, number, before)
         rays = self.shader.values(start.picture, start.time, start.sampler)
-        values = {name: _channels(TABLE[name].value(rays)) for name in self.layers}
-        if self.film is not None:
-            values = {OWN: self._own(rays), **values}
+        values = [] if self.film is None else self._own(rays)
+        for name in self.planes:
+            values += _channels(TABLE[name].value(rays))
         return start.film, values
 
     def _own(self, rays: RayValues) -> list[mi.Float]:

@@ -90,7 +90,7 @@ class Passes:
             inside = np.arange(count, dtype=np.uint32) if edge is None else edge
             row, column = np.divmod(inside, np.uint32(seen.width))
             pixels = (row + np.uint32(seen.y)) * np.uint32(width) + column + np.uint32(seen.x)
-        layers = {name: self._layer(name).reshape(count, -1) for name in exposer.layers}
+        layers = {name: self._layer(name).reshape(count, -1) for name in exposer.planes}
         with self._job.stage(step.name, len(pixels)) as advance:
             exposer.average(places, seed, pixels, layers, edge, advance)
         if "square" in step.layers:
@@ -162,11 +162,8 @@ class Passes:
         self._layer("image")[:] = picture[..., :3]
         for number, name in enumerate(exposer.own[3:], 3):
             self.layers[OWN + name] = picture[..., number, None].astype(np.float32)
-        number = len(exposer.own)
-        for name in exposer.layers:
-            channels = len(TABLE[name].letters)
-            self._layer(name)[:] = picture[..., number : number + channels]
-            number += channels
+        for name, planes in exposer.planes.items():
+            self._layer(name)[:] = picture[..., planes]
 
     # -------------------------------------------- Filters --------------------------------------------
 

@@ -149,9 +149,7 @@ class Prepared:
         plan = self._made.plan
         starts = exposer.starts(plan.passes[0].places, seed)
         pixel = dr.arange(mi.UInt32, plan.width * plan.height)
-        _, values = exposer.trace(pixel, mi.UInt32(0), starts)
-        (channels,) = values.values()
-        return channels
+        return exposer.trace(pixel, mi.UInt32(0), starts)[1]
 
 
 def _window(film: mi.Film) -> tuple[int, ...]:
