@@ -157,7 +157,7 @@ class Job:
     workspace: Workspace  #: memory for rays and filters, known once there is a plan
 
     def __init__(
-        self, progress: Progress, budget: Budget, on_round: Callable[[RoundPicture], object] | None = None
+        self, progress: Progress, budget: Budget, on_round: Callable[[RoundPicture], object] | None
     ) -> None:
         self.progress = progress
         self.budget = budget  #: bytes that it may use

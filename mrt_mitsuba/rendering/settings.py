@@ -192,11 +192,12 @@ class RenderSettings:
         if self.error is not None:
             return Goal(self.error, self.maxspp or MAX_SPP, self.maxseconds)
         if self.aamode == NOISE:
-            if (self.spp or 1) < MIN_SPP:
+            mean = self.spp or 1
+            if mean < MIN_SPP:
                 raise UsageError(
                     f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
                 )
-            return Goal(None, self.maxspp or self.spp or MIN_SPP, self.maxseconds)
+            return Goal(None, self.maxspp or mean, self.maxseconds)
         if stated is None or self.aamode is not None or self.spp is not None:
             return None
         seconds = stated.seconds if self.maxseconds is None else self.maxseconds

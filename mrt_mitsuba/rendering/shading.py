@@ -30,7 +30,7 @@ OF_FILMS = "RGBAW"  # channels of their own, a letter each
 class RayValues:
     """Values along camera rays, for the rows of the table of layers; what no row reads costs nothing.
 
-    ``valid``: did the integrator find anything, Mitsuba's alpha; ``aovs``: the integrator's own channels;
+    ``valid``: whether the integrator found anything, Mitsuba's alpha; ``aovs``: the channels of its own;
     ``trace``: the result of an integrator with a ``kernel_plan``; None for any other, where Mitsuba finds the
     first hit.
     """
@@ -47,7 +47,6 @@ class RayValues:
         trace: Trace | None = None,
     ) -> None:
         self.shader = shader
-        self.scene = shader.scene
         self.ray = ray
         self.trace = trace
         self.weight = mi.unpolarized_spectrum(weight)
@@ -62,11 +61,11 @@ class RayValues:
     @cached_property
     def si(self) -> mi.SurfaceInteraction3f:
         """Interaction at the first hit."""
-        return self.scene.ray_intersect(mi.Ray3f(self.ray))
+        return self.shader.scene.ray_intersect(mi.Ray3f(self.ray))
 
     @cached_property
     def found(self) -> mi.Bool:
-        """Is there a first hit."""
+        """Whether rays hit anything."""
         return self.si.is_valid()
 
     def at_hit(self, kind: str, value: mi.Float, miss: float = 0) -> mi.Float:
@@ -91,7 +90,7 @@ class RayValues:
     def shape(self) -> mi.Float:
         """Number of the scene's shape that is hit first, from 1; 0 for a miss."""
         hit = mi.SurfaceInteraction3f(self.si)
-        shapes = self.scene.shapes()
+        shapes = self.shader.scene.shapes()
         if mi.variant().startswith("scalar"):
             hit.shape = hit.instance or hit.shape
         else:
@@ -102,10 +101,11 @@ class RayValues:
     def material(self) -> mi.Float:
         """Number of the material that is hit first, from 1 in the order of the shapes; 0 for a miss, and in
         an instance."""
+        shapes = self.shader.scene.shapes()
         numbers = dict[int, int]()
-        materials = [shape.bsdf() for shape in self.scene.shapes()]  # kept, so that each has an id of its own
+        materials = [shape.bsdf() for shape in shapes]  # kept, so that each has an id of its own
         rows = [numbers.setdefault(id(material), len(numbers) + 1) for material in materials]
-        return ByShape(mi.Float, self.scene.shapes(), rows, 0.0)(self.si, self.found)
+        return ByShape(mi.Float, shapes, rows, 0.0)(self.si, self.found)
 
     @property
     def albedo(self) -> mi.Color3f:
@@ -126,8 +126,8 @@ class Shader:
 
     facts: SceneFacts | None = None  #: what its kernels depend on; None where it does not say
     kernel: KernelPlan | None = None  #: what its kernels hold
-    random = True  #: does it draw random numbers
-    whole = False  #: does it give whole pictures only
+    random = True  #: whether it draws random numbers
+    whole = False  #: whether it gives whole pictures only
 
     def __init__(self, source: Source, motion: Sequence[float] | None) -> None:
         integrator = source.integrator
