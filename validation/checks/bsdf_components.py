@@ -9,6 +9,7 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, off_pairs, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
+from mrt_mitsuba.validation.checks.faults import larger_by
 from mrt_mitsuba.validation.checks.law import Law, Skip, figures, finds, most, number_of
 from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, context, excess
 
@@ -30,14 +31,15 @@ SIDES = "reflection stays on its side, transmission crosses, lobes of one direct
 SELECTS = "ctx.type_mask selects lobes: integrators that treat some apart count others twice"
 
 
-def by_component(size, value, ctx, *_):
-    return value * (1 + size * (ctx.component == 0))
+@larger_by
+def in_first_component(ctx, *_):
+    return ctx.component == 0
 
 
-def by_mask(size, value, ctx, *_):
-    """Larger where lobes are asked for by their types."""
-    every = mi.BSDFContext().type_mask
-    return value * (1 + size * (ctx.type_mask != every))
+@larger_by
+def with_mask(ctx, *_):
+    """Where lobes are asked for by their types."""
+    return ctx.type_mask != mi.BSDFContext().type_mask
 
 
 def without_mask(size, ctx):
@@ -73,8 +75,8 @@ def without_mask(size, ctx):
         "samples and densities of lobes that the mask of types {mask:#x} leaves out", 0, SELECTS, MASKED
     ),
 )
-@finds("sum", "a component brighter than its share", 1e-4, eval=by_component)
-@finds("masked", "lobes brighter where they are asked for by type", 1e-4, eval=by_mask)
+@finds("sum", "a component brighter than its share", 1e-4, eval=in_first_component)
+@finds("masked", "lobes brighter where they are asked for by type", 1e-4, eval=with_mask)
 @finds("masked_samples", "types of lobes ignored", 1, context=without_mask)
 def components(law: Law, case: Case) -> None:
     """A component does what its flags say; f = Σ fᵢ; ``component`` and ``type_mask`` of ``ctx`` select."""

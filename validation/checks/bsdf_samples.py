@@ -16,6 +16,7 @@ from mrt_mitsuba.validation.checks.faults import (
     DEGREE,
     PLACE,
     larger,
+    larger_by,
     member,
     of_sample,
     of_weight,
@@ -35,12 +36,12 @@ from mrt_mitsuba.validation.checks.law import (
 )
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
 from mrt_mitsuba.validation.checks.sphere import (
+    SMALL,
     Cells,
     chi_square,
     encode,
     hold_small,
     integrate,
-    small_cells,
 )
 from mrt_mitsuba.validation.tools.compare import sidak
 
@@ -56,9 +57,10 @@ AGAIN = "the same formula, evaluated once more at a rounded direction"
 FITS = "rational fits of Smith's G1 in use are off by 0.35 %"
 
 
-def in_tenth(size, pdf, ctx, wi, wo):
-    """Larger where a tenth of the samples of a diffuse BSDF go."""
-    return pdf * dr.select(wo.x > 0.687, 1 + size, 1)
+@larger_by
+def in_tenth(ctx, wi, wo):
+    """Where a tenth of the samples of a diffuse BSDF go."""
+    return wo.x > 0.687
 
 
 def in_cone(size, pdf, ctx, wi, wo):
@@ -124,7 +126,12 @@ def sampling(law: Law, case: Case) -> None:
     """
     case.need_smooth()
     _nudged(law, case)
-    _without_density(law, case)
+    # light has a density, from random directions as well as from sampled ones
+    count = case.count(2**14, 2**18)
+    rng = np.random.default_rng((case.seed, count))
+    wi, wo = probe.unit(rng.normal(size=(2, count, 3)))
+    anywhere = Lanes(wi=wi, wo=wo, uv=rng.random((count, 2), np.float32))
+    law.hold("dark", probe.without_density(*case.both(anywhere)), anywhere)
     judged = [(view, cells) for view, cells in zip(case.views, case.densities, strict=True) if cells]
     if not judged:
         law.notes.append(f"{UNRESOLVED} at every angle")
@@ -165,17 +172,8 @@ def _nudged(law: Law, case: Case) -> None:
         law.hold("still", (changes < 2)[smooth], drawn[smooth])
 
 
-def _without_density(law: Law, case: Case) -> None:
-    """Light has a density, from random directions as well as from sampled ones."""
-    count = case.count(2**14, 2**18)
-    rng = np.random.default_rng((case.seed, count))
-    wi, wo = probe.unit(rng.normal(size=(2, count, 3)))
-    at = Lanes(wi=wi, wo=wo, uv=rng.random((count, 2), np.float32))
-    law.hold("dark", probe.without_density(*case.both(at)), at)
-
-
 def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
-    cells = small_cells()
+    cells = Cells.uniform(SMALL)
     counts = []
     for view in views:
         seen = cells.counts(encode(view.samples.wo[view.density > 0]))
@@ -185,9 +183,10 @@ def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
     hold_small(law, cells, np.sum(counts, axis=0), FIT, view.at)
 
 
-def weight_in_stairs(size, weight, u):
-    odd = dr.floor(16 * u.x) - 2 * dr.floor(8 * u.x)
-    return weight * (1 + size * odd)
+@larger_by
+def in_stairs(u):
+    """In every other step of the first random number."""
+    return dr.floor(16 * u.x) - 2 * dr.floor(8 * u.x)
 
 
 @figures(
@@ -202,7 +201,7 @@ def weight_in_stairs(size, weight, u):
 )
 @finds("density", "density that a sample states too large", 3e-3, sample=of_sample(member("pdf", larger)))
 @finds("weight", "weight of a sample too large", 3e-3, sample=of_weight(larger))
-@finds("weight", "weight of a sample in stairs", 3e-3, sample=of_weight(weight_in_stairs))
+@finds("weight", "weight of a sample in stairs", 3e-3, sample=of_weight(in_stairs))
 @finds(
     "discrete",
     "probability of a single direction too small",

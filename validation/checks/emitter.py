@@ -28,13 +28,13 @@ from mrt_mitsuba.validation.checks.law import (
 )
 from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, excess, lanes
 from mrt_mitsuba.validation.checks.sphere import (
+    SMALL,
     Cells,
     chances_of,
     chi_square,
     encode,
     hold_small,
     integrate,
-    small_cells,
 )
 from mrt_mitsuba.validation.checks.subject import Given, Subject, judge_many
 from mrt_mitsuba.validation.tools.compare import sidak
@@ -64,10 +64,7 @@ def check_emitter(
     fewer samples. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law fails that is not done.
     Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
     """
-
-    def case(given: Given, quick: bool, seed: int) -> Case:
-        return Case(given, quick, seed, scene)
-
+    case = partial(Case, scene=scene)
     return examine(case, emitter, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
 
 
@@ -88,19 +85,18 @@ class Case(Subject):
         self.lit = scene or self._lit_sphere()  # an emitter keeps neither its scene nor its shape alive
         low, high = np.nan_to_num(probe.corners(self.lit), posinf=1, neginf=-1)
         outer = 0.1 * (high - low)
-        points = self.rng.uniform(low - outer, high + outer, (2**12, 3))
-        self.points = np.float32(points)
+        self.points = np.float32(self.rng.uniform(low - outer, high + outer, (2**12, 3)))
         if alone:
             self._look_from_the_light(float(norm(high - low)))
-        flags = int(self.plugin.flags())
+        flags = self.plugin.flags()
         # whether light comes from all around, and not from single directions, a surface or a point
-        infinite = flags & int(mi.EmitterFlags.Infinite)
-        self.around = bool(infinite) and not flags & int(mi.EmitterFlags.Delta)
+        infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
+        self.around = infinite and not mi.has_flag(flags, mi.EmitterFlags.Delta)
 
     def _lit_sphere(self) -> mi.Scene:
         """A scene with the emitter and a sphere; what lights from a surface lights from a square."""
         nodes = {"type": "scene", "ball": {"type": "sphere"}}
-        if int(self.plugin.flags()) & int(mi.EmitterFlags.Surface):
+        if mi.has_flag(self.plugin.flags(), mi.EmitterFlags.Surface):
             place = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 180)
             nodes["square"] = {"type": "rectangle", "to_world": place, "light": self.plugin}
         else:
@@ -274,7 +270,7 @@ def sampling(law: Law, case: Case) -> None:
 def _in_small_cells(law: Law, case: Case) -> None:
     """Directions in cells of a degree and in slices, for places that are never sampled."""
     count = case.count(2**21, 2**23)
-    cells = small_cells()
+    cells = Cells.uniform(SMALL)
     rng = np.random.default_rng((case.seed, 3))
     seen = np.zeros(len(cells.start))
     for _ in range(count // 2**20):

@@ -26,6 +26,15 @@ def larger(size, value, *_):
     return (1 + size) * value
 
 
+def larger_by(part):
+    """A change that makes values larger by a part of the size: a function of what was asked."""
+
+    def apply(size, value, *asked):
+        return (1 + size * part(*asked)) * value
+
+    return apply
+
+
 def smaller(size, value, *_):
     return value / (1 + size)
 

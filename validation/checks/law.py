@@ -214,8 +214,7 @@ class Law:
     @property
     def note(self) -> str:
         """The worst figure in words, and remarks."""
-        name = [self.worst.name] if self.parts else []
-        return "; ".join(name + self.notes)
+        return "; ".join(filter(None, [self.worst.name, *self.notes]))
 
     @property
     def verdict(self) -> str:

@@ -9,11 +9,11 @@ the differences of order k, σ² ≈ γ_k ⟨T_k²⟩, γ_k = (k!)² / (2k)!.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from mrt_mitsuba.validation.checks.probe import Array, Lanes
+from mrt_mitsuba.validation.checks.probe import Array, Function, Lanes
 
 ROUNDING = 2.0**-24
 ALLOWANCE = 8.0  # roundings that a formula of some dozen operations may make of its own
@@ -65,13 +65,13 @@ def steps_away(x: Array, count: Array) -> Array:
 
 @np.errstate(divide="ignore", invalid="ignore")
 def measure(
-    function: Callable[[Array], Array],
+    function: Function,
     inputs: Array,
     *,
     size: Array | None = None,
     strides: Sequence[int] = STRIDES,
     seed: int = 0,
-    project: Callable[[Array], Array] | None = None,
+    project: Function | None = None,
 ) -> Lanes:
     """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K].
 
@@ -88,7 +88,7 @@ def measure(
     inputs = np.float32(inputs)
     rng = np.random.default_rng(seed)
 
-    def values(steps: Array, valid: Callable[[Array], Array] = lambda x: x) -> Array:
+    def values(steps: Array, valid: Function = lambda x: x) -> Array:
         """The function that many float32 steps [..., N, K] away. [..., N]"""
         moved = steps_away(np.broadcast_to(inputs, steps.shape), steps)
         values = function(valid(moved.reshape(-1, inputs.shape[1])))
@@ -118,7 +118,7 @@ def measure(
     return Lanes(noise=noise / unit, lost=lost, stride=np.take(strides, chosen))
 
 
-def _slope(values: Callable[[Array], Array], shape: tuple[int, ...]) -> Array:
+def _slope(values: Function, shape: tuple[int, ...]) -> Array:
     """The change of ``values`` per float32 step of each of K inputs [N, K]. [K, N]"""
     reaches = np.array(REACHES)[:, None, None, None, None]
     signs = np.array([1, -1])[:, None, None, None]

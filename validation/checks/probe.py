@@ -16,6 +16,7 @@ Array = np.ndarray
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
 BEYOND = "relative, beyond 8 times what the rounding of directions explains"  # as ``excess`` has it
 Part = TypeVar("Part", bound="Lanes")
+Function = Callable[[Array], Array]
 Call = Callable[..., Any]  # its values are a Dr.Jit array, or several
 
 

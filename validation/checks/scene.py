@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
@@ -144,10 +143,16 @@ def _hunt(source: Source, quick: bool, seed: int) -> Fault | None:
     left, top = source.sensor.film().crop_offset()
     y, x = np.argwhere(bad)[0]
     alone = int(left + x), int(top + y), 1, 1
-    with _cropped(source.sensor, alone):
+    params = mi.traverse(source.sensor)
+    crop = {"film.crop_size": alone[2:], "film.crop_offset": alone[:2]}
+    before = {key: type(params[key])(params[key]) for key in crop}
+    params.update(crop)
+    try:
         for count in COUNTS:
             if _bad(source, count, seed).any():
                 return Fault(bad.sum(), alone, count, _culprit(source, count, seed))
+    finally:
+        params.update(before)
     whole = int(left), int(top), *bad.shape[::-1]
     return Fault(bad.sum(), whole, spp, _culprit(source, spp, seed))
 
@@ -156,19 +161,6 @@ def _bad(source: Source, spp: int, seed: int) -> np.ndarray:
     """Which pixels are not finite. [H, W]"""
     picture = mi.render(source.scene, integrator=source.integrator, sensor=source.sensor, spp=spp, seed=seed)
     return ~np.isfinite(np.array(picture)).all(axis=-1)
-
-
-@contextmanager
-def _cropped(sensor: mi.Sensor, crop: tuple[int, int, int, int]) -> Iterator[None]:
-    """Crop the film for a while."""
-    params = mi.traverse(sensor)
-    keys = ("film.crop_size", "film.crop_offset")
-    before = {key: type(params[key])(params[key]) for key in keys}
-    params.update(dict(zip(keys, (crop[2:], crop[:2]), strict=True)))
-    try:
-        yield
-    finally:
-        params.update(before)
 
 
 def _culprit(source: Source, spp: int, seed: int) -> str:

@@ -96,7 +96,6 @@ class Case(Subject):
             name = self.plugin.id()
             self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
             self.plugin.set_id(name)  # which the scene has changed
-            self.unsupported = _refused(self.plugin)
         self.box = corners(self.plugin)
         if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
             raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
@@ -175,29 +174,6 @@ class Case(Subject):
             even[line] ^= True
             last[line] = hits.p
         return clear, even
-
-
-def _refused(shape: mi.Shape) -> str:
-    """What Mitsuba warned of when it loaded a shape of its own: another one is loaded, warnings as errors."""
-    params = mi.traverse(shape)
-    stock = type(shape).__module__.startswith("mitsuba")
-    if not stock or "to_world" not in params:
-        return ""
-    matrix = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
-    kind = subject.class_name(shape).lower()
-    logger = mi.logger()
-    levels = logger.log_level(), logger.error_level()
-    logger.set_log_level(mi.LogLevel.Warn)
-    logger.set_error_level(mi.LogLevel.Warn)
-    try:
-        mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
-    except RuntimeError as problem:
-        _, transform, words = str(problem).partition("'to_world' transform shouldn't")
-        return f"Mitsuba does not support it: {transform}{words}" if words else ""
-    finally:
-        logger.set_log_level(levels[0])
-        logger.set_error_level(levels[1])
-    return ""
 
 
 def offset(p: Array) -> Array:

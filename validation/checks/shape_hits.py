@@ -164,10 +164,8 @@ def close(size, si, ray):
 def surface(law: Law, case: Case) -> None:
     """Hits lie on the ray and the surface; spawned rays do not meet it where they start; digits are kept."""
     met = case.met
-    numbers = abs(np.concatenate([met.o, met.p], axis=1))
-    along = np.float64(met.o) + met.t[:, None] * met.d
-    off = abs(along - met.p).max(axis=1)
-    law.hold("on_ray", off / (ROUNDING * (numbers.max(axis=1) + met.t)), met)
+    largest = abs(np.column_stack([met.o, met.p])).max(axis=1) + met.t
+    law.hold("on_ray", _off_ray(met) / (ROUNDING * largest), met)
     _from_near_by(law, case)
     _again(law, case)
     step = 1e-3 * case.size
@@ -175,6 +173,12 @@ def surface(law: Law, case: Case) -> None:
     missed = ~again.met | (norm(again.p - met.p, axis=1) >= step)
     law.hold("missed", missed, again)
     _noise(law, case)
+
+
+def _off_ray(hits: Lanes) -> Array:
+    """How far hit points are off their rays, at the distances of the hits. [N]"""
+    along = hits.o + np.float64(hits.t[:, None]) * hits.d
+    return abs(along - hits.p).max(axis=1)
 
 
 def _again(law: Law, case: Case) -> None:
@@ -193,7 +197,7 @@ def _noise(law: Law, case: Case) -> None:
     """The noise of distance, hit point and normal."""
     met = case.few(case.met, 300, 1000)
     scale = abs(met.o).max(axis=1) + met.t
-    inputs = np.concatenate([met.o, met.d], axis=1)
+    inputs = np.column_stack([met.o, met.d])
 
     def number(which: int, x: Array) -> Array:
         hits = trace(case.target, x[:, :3], x[:, 3:])
@@ -214,14 +218,12 @@ def _from_near_by(law: Law, case: Case) -> None:
     again = trace(case.target, met.p - reach * d, d)
     same = again.met & near(met.p, again.p)
     largest = abs(met.p).max(axis=1) + reach
-    along = again.o + np.float64(again.t[:, None]) * d
-    off = abs(along - again.p).max(axis=1)
     # the same line the other way around, from as far behind
     back = trace(case.target, met.p + reach * d, -d)
     apart = norm(np.float64(back.p) - again.p, axis=1) * abs(dot(met.n, d))
     alike = same & back.met & (back.part == met.part) & (apart < 0.01 * case.size)
     alike &= case.behind.met.mean() > 0.5  # else rays pass it from behind
-    law.hold("near_by", off / (ROUNDING * largest), again, where=same)
+    law.hold("near_by", _off_ray(again) / (ROUNDING * largest), again, where=same)
     law.hold("behind", apart / (ROUNDING * largest), again, where=alike)
 
 
@@ -378,8 +380,7 @@ def watertight(law: Law, case: Case) -> None:
         law.notes.append("no room inside to start rays in")
         return
     count = case.count(10**5, 10**6)
-    o = inside[case.rng.integers(len(inside), size=count)]
-    hits = trace(case.target, o, case.units(count))
+    hits = trace(case.target, case.rng.choice(inside, count), case.units(count))
     out = stats.binomtest(count - hits.met.sum(), count)
     surely = out.proportion_ci(1 - 2 * LEVEL).low  # Clopper and Pearson
     law.hold("out", surely, hits[hits.met.argmin()], count=count)
@@ -388,13 +389,11 @@ def watertight(law: Law, case: Case) -> None:
 def _inside(case: Case) -> Array:
     """Points well inside: the middles of the longer first chords of lines. [N, 3]"""
     if len(case.crossings) < 2:
-        return np.zeros((0, 3), np.float32)
+        return np.zeros((0, 3))
     (first, entries), (second, exits) = case.crossings[:2]
-    _, i, j = np.intersect1d(first, second, return_indices=True)
-    entry = entries.p[i]
-    exit_ = exits.p[j]
-    chord = norm(entry - exit_, axis=1)
-    return ((entry + exit_) / 2)[chord >= np.median(chord)].astype(np.float32)
+    entry = entries.p[np.searchsorted(first, second)]  # of the lines that go on
+    chord = norm(entry - exits.p, axis=1)
+    return ((entry + exits.p) / 2)[chord >= np.median(chord)]
 
 
 SCALED = """print("as it is, t:", scene.ray_intersect(mi.Ray3f(o, d)).t)
@@ -514,10 +513,10 @@ def finite(law: Law, case: Case) -> None:
     count = case.count(2**12, 2**15)
     corners = np.where(rng.random((count, 3)) < 0.5, case.low, case.high)
     middles = np.broadcast_to(case.middle, (count, 3))
-    on_surface = met.p[rng.integers(len(met.p), size=count)]
+    on_surface = rng.choice(met.p, count)
     distances = case.size * 10.0 ** rng.uniform(0, 5, (count, 1))
     afar = case.middle + distances * case.units(count)
-    vertices = case.points[rng.integers(len(case.points), size=count)]
+    vertices = rng.choice(case.points, count)
     kinds = (corners, middles, on_surface, afar, vertices)
     o = np.choose(rng.integers(len(kinds), size=count)[:, None], kinds).astype(np.float32)
     d = case.units(count)
@@ -525,11 +524,10 @@ def finite(law: Law, case: Case) -> None:
     d = unit(d + np.where((d == 0).all(axis=1, keepdims=True), [0, 0, 1], 0))
     d[(d == 0) & (rng.random(d.shape) < 0.3)] = 1e-30
     to_middle = case.middle - o
-    towards = unit(np.where(abs(to_middle) > 0, to_middle, 1))
+    towards = unit(np.where(to_middle == 0, 1, to_middle))
     d = np.where(rng.random((count, 1)) < 0.3, towards, d)
     hits = trace(case.target, o, d)
-    vectors = (hits.p, hits.n, hits.shading, hits.uv, hits.du, hits.dv)
-    numbers = np.concatenate([hits.t[:, None], *vectors], axis=1)
+    numbers = np.column_stack([hits.t, hits.p, hits.n, hits.shading, hits.uv, hits.du, hits.dv])
     sound = np.isfinite(numbers).all(axis=1) & (hits.t >= 0)
     law.hold("bad", np.where(hits.met, ~sound, np.isnan(hits.t)), hits)  # a miss is infinitely far
     subject.judge_many(law, case, partial(_at_random, case))

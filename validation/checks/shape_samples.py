@@ -221,9 +221,8 @@ def _area(law: Law, case: Case, s: Lanes, area: float) -> None:
         crossed[line] += 1
         points.append(hits.p)
     crossings = np.concatenate(points)
-    estimate = 2 * np.pi * radius**2 * crossed.mean()
-    error = 2 * np.pi * radius**2 * crossed.std() / np.sqrt(count)
-    beyond = max(abs(estimate - area) - SIGMAS * error, 0)
+    estimates = 2 * np.pi * radius**2 * crossed
+    beyond = max(abs(estimates.mean() - area) - SIGMAS * estimates.std() / np.sqrt(count), 0)
     room = 3e-3 + 20 * float(offset(s.p).max()) / case.size + twice
     law.hold("crossings", beyond / area, limit=room)
     if twice > ROOM:
@@ -362,8 +361,7 @@ def _aim(case: Case, count: int) -> float:
 def _moments(case: Case, met: Lanes, weight: Array) -> tuple[Array, Array]:
     """Means [8] of weights, alone and times place, its squares and the angle, and their variances [8]."""
     place = (met.p - case.middle) / case.size
-    cosine = dot(met.d, unit(case.middle - met.o))[:, None]
-    angle = (1 - cosine) * 2 * np.pi / CONE
-    factors = np.concatenate([np.ones_like(angle), place, 4 * place**2, angle], axis=1)
+    angle = (1 - dot(met.d, unit(case.middle - met.o))) * 2 * np.pi / CONE
+    factors = np.column_stack([np.ones_like(angle), place, 4 * place**2, angle])
     products = np.where(weight[:, None] > 0, weight[:, None] * factors, 0)
     return products.mean(axis=0), products.var(axis=0) / len(products)

@@ -7,14 +7,14 @@ Morton code at which it starts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
 from mrt_mitsuba.validation.checks.law import NOWHERE, Law
-from mrt_mitsuba.validation.checks.probe import Array, Lanes, finite_or_0, joined
+from mrt_mitsuba.validation.checks.probe import Array, Function, Lanes, finite_or_0, joined
 from mrt_mitsuba.validation.tools.compare import sidak
 
 DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
@@ -44,12 +44,17 @@ class Cells(Lanes):
     """Cells that cover the sphere: ``start`` and ``level`` [C], and what else is known of each."""
 
     @staticmethod
+    def uniform(level: int) -> Cells:
+        """All cells of a level."""
+        start = np.arange(2 * 4**level) * 4 ** (DEPTH - level)
+        return Cells(start=start, level=np.full(len(start), level))
+
+    @staticmethod
     def around(codes: Array, most: int, coarsest: int = 4) -> Cells:
         """Cells that hold at most ``most`` of the directions each; only the finest may hold more."""
         codes = np.sort(codes)
         done = []
-        start = np.arange(2 * 4**coarsest) * 4 ** (DEPTH - coarsest)
-        cells = Cells(start=start, level=np.full(len(start), coarsest))
+        cells = Cells.uniform(coarsest)
         while len(cells.start):
             first, last = np.searchsorted(codes, [cells.start, cells.end])
             full = (last - first > most) & (cells.level < DEPTH)
@@ -117,7 +122,7 @@ class Cells(Lanes):
         r, _ = self.corner
         return 2 * np.pi * self.width * ((r + self.width) ** 2 - r**2)
 
-    def bounds(self, index: int) -> tuple[float, float, float, float, int]:
+    def bounds(self, index: int) -> tuple[float, ...]:
         """r and φ from … to, and the sign of z, of one cell."""
         r, turn = (float(x[index]) for x in self.corner)
         width = float(self.width[index])
@@ -128,15 +133,13 @@ class Cells(Lanes):
         """How many of the directions lie in each cell, or the sum of their weights. [C]"""
         return np.bincount(self.find(codes), weights, minlength=len(self.start))
 
-    def integrals(self, function: Callable[[Array], Array], rng: np.random.Generator) -> tuple[Array, Array]:
+    def integrals(self, function: Function, rng: np.random.Generator) -> tuple[Array, Array]:
         """Integrals of ``function(directions [N, 3]) -> [N, K]`` over cells, and their variances. [C, K]"""
         wo, omega = self.points(rng)
         values = function(wo.reshape(-1, 3)).reshape(*omega.shape, -1) * omega[..., None] * POINTS
         return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
 
-    def expected(
-        self, density: Callable[[Array], Array], count: int, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
+    def expected(self, density: Function, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """How many of ``count`` samples of a density each cell expects, and the variance of that. [C], [C]"""
         share, variance = self.integrals(density, rng)
         return count * share[:, 0], count**2 * variance[:, 0]
@@ -147,11 +150,6 @@ class Cells(Lanes):
         x, y, _ = self.middle.T
         for place in (r, turn, 0.5 + 0.4999 * x, 0.5 + 0.4999 * y):
             yield np.floor(place / self.width).astype(int) * 2 + self.below
-
-
-def small_cells() -> Cells:
-    """Cells of about a degree over the whole sphere."""
-    return Cells.around(np.zeros(0, np.int64), 0, SMALL)
 
 
 def summed(counts: Array, group: Array) -> Array:
@@ -189,7 +187,7 @@ def in_order(parts: Sequence[Cells]) -> Cells:
 
 
 def integrate(
-    function: Callable[[Array], Array],
+    function: Function,
     cells: Cells,
     rng: np.random.Generator,
     codes: Array,
@@ -230,7 +228,7 @@ def integrate(
 
 def chi_square(
     integrals: Cells, codes: Array, count: int, known: float = 0.0
-) -> tuple[Array, tuple[float, float, float, float, int]]:
+) -> tuple[Array, tuple[float, ...]]:
     """Compare the counts of samples with those that integrals expect.
 
     The first result is χ² and its degrees of freedom [6, 2] in six ways to group cells, so that faults of any

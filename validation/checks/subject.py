@@ -44,7 +44,6 @@ class Subject:
         self.seed = seed
         self.rng = np.random.default_rng(seed)
         self.description: Description | None = None  # None where a loaded object was given
-        self.unsupported = ""  # what Mitsuba itself says against it
         if isinstance(given, dict):
             self.description = _kept(given)
             self.name = str(given.get("type", "dict"))
@@ -52,6 +51,8 @@ class Subject:
         else:
             self.name = class_name(given)
             self.plugin = given
+        # what Mitsuba itself says against it
+        self.unsupported = _refused(self.plugin) if isinstance(self.plugin, mi.Shape) else ""
 
     def with_(self, **changes: Any) -> Description:
         """The dict with other values of some parameters. Raises ``Skip`` without one."""
@@ -171,6 +172,29 @@ def class_name(plugin: mi.Object) -> str:
     """Name of a plugin's class: Mitsuba calls all those in Python by that of their base."""
     python = type(plugin).__module__.split(".")[0] != "mitsuba"
     return type(plugin).__name__ if python or not hasattr(plugin, "class_name") else plugin.class_name()
+
+
+def _refused(shape: mi.Shape) -> str:
+    """What Mitsuba warned of when it loaded a shape of its own: another one is loaded, warnings as errors."""
+    params = mi.traverse(shape)
+    stock = type(shape).__module__.startswith("mitsuba")
+    if not stock or "to_world" not in params:
+        return ""
+    matrix = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
+    kind = class_name(shape).lower()
+    logger = mi.logger()
+    levels = logger.log_level(), logger.error_level()
+    logger.set_log_level(mi.LogLevel.Warn)
+    logger.set_error_level(mi.LogLevel.Warn)
+    try:
+        mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
+    except RuntimeError as problem:
+        _, transform, words = str(problem).partition("'to_world' transform shouldn't")
+        return f"Mitsuba does not support it: {transform}{words}" if words else ""
+    finally:
+        logger.set_log_level(levels[0])
+        logger.set_error_level(levels[1])
+    return ""
 
 
 def _kept(value: Given) -> Given:
