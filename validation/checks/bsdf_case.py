@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -41,6 +41,37 @@ class View:
     count: int  # of the others
     share: float  # of the others that count
     holes: float  # share of samples at which eval() is not finite
+    case: Case
+
+    def pdf(self, wo: Array) -> Array:
+        """The density of directions [M, 3]. [M]"""
+        return np.maximum(self.case.pdf(self.at.having(wo=wo)), 0)
+
+    @cached_property
+    def cells(self) -> Cells | None:
+        """Cells that resolve the density, with its integrals; None where none do."""
+        # around the mirror direction at all scales, where lobes may be that are not sampled
+        scales = 10 ** self.case.rng.uniform(-4, 0, (600, 1))
+        mirrored = self.at.wi * [-1, -1, 1] + scales * self.case.rng.normal(size=(600, 3))
+        seeds = encode(np.concatenate([self.pilot, unit(mirrored)]))
+        most = max(len(self.density) // 4000, 8)
+        cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
+        crowd = cells.counts(encode(self.pilot))
+        crowded = (crowd * ((cells.level == DEPTH) & (crowd > 4 * most))).sum()
+        # at the normal, all azimuths of the finest cells are one place
+        radius = np.hypot(*self.pilot.T[:2])
+        centre = (radius < np.sqrt(2) * 0.5**DEPTH).sum()
+        if max(crowded, centre) > 0.01 * len(self.pilot):  # samples are closer together than the finest cells
+            return None
+        integrals = integrate(self.pdf, cells, self.case.rng, self.codes, self.count)
+        # samples in cells where fewer than two of the cell's points are expected within the lobe
+        density_there = self.density[-self.count :]
+        weights = 1 / (self.count * density_there[density_there > 0])
+        covered = integrals.counts(self.codes, weights)
+        coarse = covered * POINTS < 2 * integrals.solid_angle
+        overlooked = integrals.counts(self.codes)[coarse].sum() / self.count
+        known = integrals.mean.sum() > self.share or overlooked < OVERLOOKED
+        return integrals if known else None
 
 
 class Case(Subject, Probe):
@@ -70,7 +101,8 @@ class Case(Subject, Probe):
             pilot = samples.wo[:first][density[:first] > 0]
             codes = encode(samples.wo[first:][density[first:] > 0])
             count = len(u) - first
-            views.append(View(at, samples, density, pilot, codes, count, len(codes) / count, holes.mean()))
+            share = len(codes) / count
+            views.append(View(at, samples, density, pilot, codes, count, share, holes.mean(), self))
         return views
 
     @cached_property
@@ -83,39 +115,6 @@ class Case(Subject, Probe):
     def incidence(self) -> Lanes:
         """The directions of incidence ``wi`` and texture coordinates ``uv`` of all views."""
         return joined([view.at[np.newaxis] for view in self.views])
-
-    @cached_property
-    def densities(self) -> list[Cells | None]:
-        """The integrals of the density for each view, in cells that resolve it; None where none do."""
-        return [self._integrals(view) for view in self.views]
-
-    def density(self, view: View, wo: Array) -> Array:
-        """The density of directions [M, 3] as seen in a view. [M]"""
-        return np.maximum(self.pdf(view.at.having(wo=wo)), 0)
-
-    def _integrals(self, view: View) -> Cells | None:
-        # around the mirror direction at all scales, where lobes may be that are not sampled
-        scales = 10 ** self.rng.uniform(-4, 0, (600, 1))
-        mirrored = view.at.wi * [-1, -1, 1] + scales * self.rng.normal(size=(600, 3))
-        seeds = encode(np.concatenate([view.pilot, unit(mirrored)]))
-        most = max(len(view.density) // 4000, 8)
-        cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
-        crowd = cells.counts(encode(view.pilot))
-        crowded = (crowd * ((cells.level == DEPTH) & (crowd > 4 * most))).sum()
-        # at the normal, all azimuths of the finest cells are one place
-        radius = np.hypot(*view.pilot.T[:2])
-        centre = (radius < np.sqrt(2) * 0.5**DEPTH).sum()
-        if max(crowded, centre) > 0.01 * len(view.pilot):  # samples are closer together than the finest cells
-            return None
-        integrals = integrate(partial(self.density, view), cells, self.rng, view.codes, view.count)
-        # samples in cells where fewer than two of the cell's points are expected within the lobe
-        density_there = view.density[-view.count :]
-        weights = 1 / (view.count * density_there[density_there > 0])
-        covered = integrals.counts(view.codes, weights)
-        coarse = covered * POINTS < 2 * integrals.solid_angle
-        overlooked = integrals.counts(view.codes)[coarse].sum() / view.count
-        known = integrals.mean.sum() > view.share or overlooked < OVERLOOKED
-        return integrals if known else None
 
     def copy(self) -> Case:
         """A case whose parameters can be changed, with a BSDF of its own if it can be loaded."""
@@ -164,8 +163,8 @@ class Case(Subject, Probe):
         return probe.spread(lambda wi, wo: quantity(at.having(wi=wi, wo=wo)), (at.wi, at.wo), self.rng)
 
 
-def off_pairs(pairs: Lanes, value: Array, pdf: Array) -> Array:
-    """How far other values and densities at pairs are off theirs, relative, beyond rounding. [N]"""
+def pair_errors(pairs: Lanes, value: Array, pdf: Array) -> Array:
+    """Relative errors of values and densities against those of pairs, beyond rounding. [N]"""
     return np.maximum(excess(value, pairs.value, pairs.value_off), excess(pdf, pairs.pdf, pairs.pdf_off))
 
 

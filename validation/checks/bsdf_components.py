@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, off_pairs, parameters
+from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, pair_errors, parameters
 from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
 from mrt_mitsuba.validation.checks.faults import larger_by
 from mrt_mitsuba.validation.checks.law import Law, Skip, figures, finds, most, number_of
@@ -82,9 +82,9 @@ def components(law: Law, case: Case) -> None:
     """A component does what its flags say; f = Σ fᵢ; ``component`` and ``type_mask`` of ``ctx`` select."""
     bsdf = case.plugin
     p = case.pairs
-    flags = [int(bsdf.flags(i)) for i in range(bsdf.component_count())]
-    union = np.bitwise_or.reduce(flags or [0])
-    law.hold("flags", bin(union ^ int(bsdf.flags())).count("1"))
+    flags = [bsdf.flags(i) for i in range(bsdf.component_count())]
+    union = int(np.bitwise_or.reduce(flags or [0]))
+    law.hold("flags", (union ^ bsdf.flags()).bit_count())
     if case.description is not None:
         copy = case.load()
         old = dict(parameters(case))
@@ -130,7 +130,7 @@ def _allowed(flags: int, at: Lanes) -> Array:
 
 def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
     """With a mask of types, a BSDF is the sum of the components of these types."""
-    every = int(mi.BSDFFlags.All)
+    every = mi.BSDFFlags.All
     kinds = [flag & every for flag in flags]
     p = case.pairs
     few = case.few(p, 2**12, 2**13)
@@ -180,7 +180,9 @@ def variants(law: Law, case: Case) -> None:
         if not other.endswith("_rgb"):  # the mean of equal channels, however many there are
             value = value.mean(axis=1)
             expected = few.having(value=few.value.mean(axis=1), value_off=few.value_off.max(axis=1))
-        law.hold("same", off_pairs(expected, value, pdf), few, variants=(here, other), other=other, here=here)
+        law.hold(
+            "same", pair_errors(expected, value, pdf), few, variants=(here, other), other=other, here=here
+        )
 
 
 @figures(
@@ -202,5 +204,5 @@ def switch(law: Law, case: Case) -> None:
     if case.description is not None:
         candidates["loaded anew"] = case.load()
     for which, bsdf in candidates.items():
-        error = off_pairs(few, *Probe(bsdf).both(few))
+        error = pair_errors(few, *Probe(bsdf).both(few))
         law.hold("same", error, few, which=which, other=other, variants=(here, other, here))

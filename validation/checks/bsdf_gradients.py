@@ -11,7 +11,7 @@ import numpy as np
 from mrt_mitsuba.validation.checks import probe
 from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, live, narrow, parameters
 from mrt_mitsuba.validation.checks.faults import GLOSS, of_weight
-from mrt_mitsuba.validation.checks.law import SIGMAS, Law, Skip, figures, finds, most, number_of
+from mrt_mitsuba.validation.checks.law import FEWEST, SIGMAS, Law, Skip, figures, finds, most, number_of
 from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
@@ -128,7 +128,7 @@ def _attached(law: Law, case: Case, key: str) -> bool:
         _reached(law, case, key)
     off = abs(derivative - slope)
     known = np.isfinite(error)
-    if known.sum() < 20:
+    if known.sum() < FEWEST:
         law.notes.append(f"{key}: its least differences move lobes away, and cannot judge derivatives")
         return True
     usual = known & (off <= np.quantile(off[known], 0.98))  # where values have a kink, no slope is

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -132,11 +130,11 @@ def sampling(law: Law, case: Case) -> None:
     wi, wo = probe.unit(rng.normal(size=(2, count, 3)))
     anywhere = Lanes(wi=wi, wo=wo, uv=rng.random((count, 2), np.float32))
     law.hold("dark", probe.without_density(*case.both(anywhere)), anywhere)
-    judged = [(view, cells) for view, cells in zip(case.views, case.densities, strict=True) if cells]
+    judged = [(view, view.cells) for view in case.views if view.cells]
     if not judged:
         law.notes.append(f"{UNRESOLVED} at every angle")
         return
-    at = case.incidence[[cells is not None for cells in case.densities]]
+    at = case.incidence[[bool(view.cells) for view in case.views]]
     tests = []  # [angles, 6, 2]
     worst = []
     beyond = []
@@ -177,7 +175,7 @@ def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
     counts = []
     for view in views:
         seen = cells.counts(encode(view.samples.wo[view.density > 0]))
-        expected = cells.expected(partial(case.density, view), len(view.density), case.rng)
+        expected = cells.expected(view.pdf, len(view.density), case.rng)
         counts.append([seen, *expected])
     view = max(views, key=lambda v: v.at.wi[2])
     hold_small(law, cells, np.sum(counts, axis=0), FIT, view.at)
@@ -279,14 +277,14 @@ def energy(law: Law, case: Case) -> None:
         s = case.sample(grazing[i].having(u=case.uniform(count, 3)), mode)
         means.append(_mean(s.weight))
     apart = []
-    for view, cells in zip(case.views, case.densities, strict=True):
+    for view in case.views:
         s = case.sample(view.samples, mode)
         means.append(_mean(s.weight))
         # where values are NaN, the law ``finite`` says so
-        apart.append(_apart(case, view, cells, s) if cells and view.holes < 0.01 else 0)
+        apart.append(_apart(case, view, view.cells, s) if view.cells and view.holes < 0.01 else 0)
     surely = [(mean - SIGMAS * error).max() for mean, error in means]
     law.hold("largest", surely, joined([grazing, case.incidence]))
-    if any(case.densities):
+    if any(view.cells for view in case.views):
         law.hold("apart", apart, case.incidence)
 
 

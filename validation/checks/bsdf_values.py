@@ -208,7 +208,7 @@ COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
 AZIMUTHS = (0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4)
 INDICES = ("eta", "k", "int_ior", "ext_ior")
 UNIFORM = (0, 2.0**-24, 0.5, 1 - 2.0**-24)
-WRONG = "results not finite, or negative{words_of_it}: {faults}"
+WRONG = "results not finite, or negative{with_setting}: {faults}"
 SPOILS = "one such number spoils a picture"
 
 
@@ -294,10 +294,10 @@ def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None =
     kinds = values if wrong_values else samples
     words = ", ".join(f"{kind} {faults.sum()}" for kind, faults in kinds.items() if faults.any())
     if words or not setting:
-        words_of_it = f" with {setting[0]} = {setting[1]:g}" if setting else ""
+        with_setting = f" with {setting[0]} = {setting[1]:g}" if setting else ""
         name = "values" if wrong_values else "samples"
         faults = np.any([*kinds.values()], axis=0)
-        law.hold(name, faults, at, setting=setting, words_of_it=words_of_it, faults=words or "none")
+        law.hold(name, faults, at, setting=setting, with_setting=with_setting, faults=words or "none")
     return not words
 
 
@@ -359,13 +359,12 @@ def roundoff(law: Law, case: Case) -> None:
     def brightest(at: Lanes) -> Array:
         return case.eval(at).max(axis=1)
 
+    def values(function: Callable[[Lanes], Array], x: Array) -> Array:
+        uv = np.tile(few.uv, (len(x) // len(few.uv), 1))
+        return function(Lanes(wi=x[:, :3], wo=x[:, 3:], uv=uv))
+
     for name, function in (("eval", brightest), ("pdf", case.pdf)):
-
-        def values(x: Array, function: Callable[[Lanes], Array] = function) -> Array:
-            uv = np.tile(few.uv, (len(x) // len(few.uv), 1))
-            return function(Lanes(wi=x[:, :3], wo=x[:, 3:], uv=uv))
-
-        estimate = noise.measure(values, inputs, seed=case.seed, project=both_unit)
+        estimate = noise.measure(partial(values, function), inputs, seed=case.seed, project=both_unit)
         if np.isnan(estimate.noise).mean() > 0.25:
             raise Skip("values change too fast for float32 steps to tell noise")
         law.hold("lost", estimate.lost, few, function=name, stride=estimate.stride)

@@ -27,7 +27,7 @@ def larger(size, value, *_):
 
 
 def larger_by(part):
-    """A change that makes values larger by a part of the size: a function of what was asked."""
+    """Make a change of a function of what was asked: values grow by the size times its result."""
 
     def apply(size, value, *asked):
         return (1 + size * part(*asked)) * value

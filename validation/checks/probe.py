@@ -24,11 +24,11 @@ class Lanes(SimpleNamespace):
     """Arrays by name that have a row for each of N lanes."""
 
     def __getitem__(self: Part, keep: Any) -> Part:
-        """Some of the lanes, as of an array."""
+        """Some of the lanes, selected as in an array."""
         return type(self)(**{name: column[keep] for name, column in vars(self).items()})
 
     def having(self: Part, **columns: Array) -> Part:
-        """The same lanes with some columns more, or in place of others."""
+        """The same lanes with columns added or replaced."""
         return type(self)(**{**vars(self), **columns})
 
 
@@ -93,7 +93,7 @@ def at_wavelengths(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
 class Probe:
     """Asks one BSDF about lanes: ``wi`` and ``wo`` [N, 3] in its frame, ``uv`` [N, 2], ``u`` [N, 3].
 
-    Of ``wi`` and ``uv`` there may be one for all lanes.
+    ``wi`` and ``uv`` may also be the same for all lanes: [3] and [2].
     """
 
     def __init__(self, bsdf: mi.BSDF) -> None:
@@ -132,10 +132,11 @@ class Probe:
         return self.ask(self.plugin.eval_pdf, at, ctx)
 
     def sample(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> Lanes:
-        """Samples by ``u``, together with where: ``wo`` [N, 3], ``weight`` [N, channels], the others [N].
+        """The lanes with a sample each: ``wo`` [N, 3], ``weight`` [N, channels], the others [N].
 
-        ``delta``: whether it is from a lobe of one direction only; ``lit``: whether its weight is not 0.
-        Directions that are not finite are 0.
+        ``delta``: whether it is from a lobe of one direction only; ``lit``: whether its weight is not 0;
+        ``lobe``: the index of its component; ``flags``: those of the lobe. Directions that are not finite
+        become 0.
         """
 
         def call(c: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Vector3f) -> Sequence[Any]:
@@ -166,9 +167,9 @@ def not_finite(*values: mi.Float | mi.Spectrum, least: float = -np.inf) -> mi.Ma
 
 
 def bad_samples(weight: mi.Spectrum, d: mi.Vector3f, *numbers: mi.Float | mi.Spectrum) -> mi.Mask:
-    """Where samples spoil a picture: by a weight that is not finite, or negative.
+    """Where samples spoil a picture: their weights are not finite, or negative.
 
-    Or, unless the weight is 0, by such a one of ``numbers``, or a direction that is not of length 1.
+    Where weights are not 0, the same goes for ``numbers``, and directions must be of length 1.
     """
     not_unit = ~(dr.abs(dr.squared_norm(d) - 1) < 2e-3)
     lit = dr.any(weight != 0)
@@ -183,9 +184,10 @@ def lanes(call: Call, *columns: tuple[str, Array]) -> list[Array]:
     count = len(columns[0][1])
     if is_scalar():
         rows = []
-        for row in zip(*(column for _, column in columns), strict=True):
-            numbers = zip(columns, row, strict=True)
-            arguments = [getattr(mi, kind)(*np.atleast_1d(number).tolist()) for (kind, _), number in numbers]
+        kinds, arrays = zip(*columns, strict=True)
+        for row in zip(*arrays, strict=True):
+            numbers = zip(kinds, row, strict=True)
+            arguments = [getattr(mi, kind)(*np.atleast_1d(number).tolist()) for kind, number in numbers]
             rows.append([np.asarray(value) for value in _values(call, arguments)])
         return [np.array(values) for values in zip(*rows, strict=True)]
     with dr.suspend_grad():

@@ -95,9 +95,9 @@ def check_scene(
     runtime.use()
     source = open_scene(scene, **options)
     kinds = _plugins(source.scene)
-    lamps = partial(check_emitter, scene=source.scene)
+    lights = partial(check_emitter, scene=source.scene)
     check_of: dict[str, Callable[..., Check]]
-    check_of = {"BSDF": check_bsdf, "shape": check_shape, "emitter": lamps}
+    check_of = {"BSDF": check_bsdf, "shape": check_shape, "emitter": lights}
     checks = {}
     left_out = []
     chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}

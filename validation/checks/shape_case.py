@@ -104,8 +104,9 @@ class Case(Subject):
         if "faces" in params:  # a rectangle hides that it is a mesh
             vertex = np.array(params["vertex_positions"]).reshape(-1, 3)
             face = np.array(params["faces"]).reshape(-1, 3)
-            middles = [(vertex[face[:, k]] + vertex[face[:, k - 1]]) / 2 for k in range(3)]
-            self.points = np.concatenate([self.box, vertex, *middles])
+            ends = vertex[face]  # [F, 3, 3]
+            middles = (ends + np.roll(ends, 1, axis=1)) / 2
+            self.points = np.concatenate([self.box, vertex, middles.reshape(-1, 3)])
         self.low = self.points.min(axis=0)  # the box itself may be wrong
         self.high = self.points.max(axis=0)
         self.middle = (self.low + self.high) / 2

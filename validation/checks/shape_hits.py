@@ -176,7 +176,7 @@ def surface(law: Law, case: Case) -> None:
 
 
 def _off_ray(hits: Lanes) -> Array:
-    """How far hit points are off their rays, at the distances of the hits. [N]"""
+    """The distance of hit points from where their rays are after ``t``, per axis at most. [N]"""
     along = hits.o + np.float64(hits.t[:, None]) * hits.d
     return abs(along - hits.p).max(axis=1)
 
@@ -326,10 +326,10 @@ def _differences(law: Law, case: Case) -> None:
         length = norm(step, axis=1)
         ok = other.met & (other.part == met.part) & (dot(other.n, met.n) > 0.9)
         ok &= (length < 40 * h * case.size) & (length > 0)
-        du, dv = (other.uv - met.uv).T[:, :, None].astype(np.float64)
+        uv = (other.uv - met.uv).astype(np.float64)
         slopes.append(np.where(ok, abs(dot(step, met.n)) / length, np.nan))
-        off = norm(step - du * met.du - dv * met.dv, axis=1) / length
-        ok &= (np.abs([du, dv]).max(axis=(0, 2)) < 0.2) & met.du.any()
+        off = norm(step - uv[:, :1] * met.du - uv[:, 1:] * met.dv, axis=1) / length
+        ok &= (abs(uv).max(axis=1) < 0.2) & met.du.any()
         partials.append(np.where(ok, off, np.nan))
     for name, (wide, narrow) in (("slope", slopes), ("step", partials)):
         law.hold(name, np.maximum(2 * narrow - wide, 0), met, aside=aside, size=case.size)

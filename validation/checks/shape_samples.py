@@ -210,7 +210,7 @@ def _area(law: Law, case: Case, s: Lanes, area: float) -> None:
     disk = radius * np.sqrt(case.rng.random((count, 1))) * across
     start = case.middle + disk - 2 * radius * d
     # where two parts of the surface coincide, a line meets only one of them
-    at = Lanes(p=s.p, n=unit(s.n))
+    at = s.having(n=unit(s.n))
     one = trace(case.target, leave(at, at.n), -at.n)
     other = trace(case.target, leave(at, -at.n), at.n)
     both = one.met & other.met & (one.part != other.part)

@@ -140,7 +140,7 @@ class Cells(Lanes):
         return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
 
     def expected(self, density: Function, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """How many of ``count`` samples of a density each cell expects, and the variance of that. [C], [C]"""
+        """How many of ``count`` samples are expected in each cell, and the variance of that. [C], [C]"""
         share, variance = self.integrals(density, rng)
         return count * share[:, 0], count**2 * variance[:, 0]
 
@@ -153,15 +153,15 @@ class Cells(Lanes):
 
 
 def summed(counts: Array, group: Array) -> Array:
-    """The sums of counts [..., C] over groups of cells, by the number of the group of each [C]. [..., G]"""
+    """Sums of counts [K, C] over groups of cells; ``group`` [C] is the number of each cell's group. [K, G]"""
     return np.array([np.bincount(group, row) for row in counts])
 
 
 def hold_small(law: Law, cells: Cells, counts: Array, known: float, at: Lanes = NOWHERE) -> None:
-    """Hold ``small`` to the least chance of ``counts`` [3, C] in cells, and ``slices`` to that in their rows.
+    """Hold ``small`` to the least chance of counts in cells, and ``slices`` to that of counts in their rows.
 
-    These are how many samples are seen, how many expected, and the variance of that number. ``known``: to how
-    much densities are known, relative.
+    ``counts`` [3, C]: samples seen, samples expected, and the variance of the latter. ``known``: the relative
+    error to which densities are known.
     """
     counts = np.where(np.isfinite(counts[1]), counts, 0)  # where they are not, the law ``finite`` says so
     chances = chances_of(counts, known)
@@ -172,7 +172,7 @@ def hold_small(law: Law, cells: Cells, counts: Array, known: float, at: Lanes = 
 
 
 def chances_of(counts: Array, known: float) -> Array:
-    """The chances of so many or so few where a Poisson distribution expects as many: of ``counts`` [3, C]."""
+    """The chances of so many or so few samples by a Poisson distribution, of ``counts`` [3, C]. [C]"""
     seen, expected, variance = counts
     room = 3 * np.sqrt(variance) + known * expected  # is not Poisson's
     many = stats.poisson.sf(seen - 1, expected + room)

@@ -175,7 +175,10 @@ def class_name(plugin: mi.Object) -> str:
 
 
 def _refused(shape: mi.Shape) -> str:
-    """What Mitsuba warned of when it loaded a shape of its own: another one is loaded, warnings as errors."""
+    """What Mitsuba warns of in the transform of a stock shape, "" if nothing.
+
+    A shape of the same kind is loaded while warnings are errors.
+    """
     params = mi.traverse(shape)
     stock = type(shape).__module__.startswith("mitsuba")
     if not stock or "to_world" not in params:
