@@ -107,10 +107,12 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
 
 def listing() -> str:
     """A line on each study, with how long it takes on two idle cores."""
-    quick, full = (sum(seconds) for seconds in list(zip(*STUDIES.values(), strict=True))[2:])
-    rows = [(name, *entry[1:]) for name, entry in STUDIES.items()] + [("all", "all of these", quick, full)]
-    lines = [f"  {n:<15}{_spoken(quick):>7}{_spoken(full):>8}  {about}" for n, about, quick, full in rows]
-    return "\n".join([f"  {'':<15}{'quick':>7}{'full':>8}", *lines])
+    _, _, quick_seconds, full_seconds = zip(*STUDIES.values(), strict=True)
+    everything = ("", "all of these", sum(quick_seconds), sum(full_seconds))
+    lines = [f"  {'':<15}{'quick':>7}{'full':>8}"]
+    for name, (_, about, quick, full) in {**STUDIES, "all": everything}.items():
+        lines.append(f"  {name:<15}{_spoken(quick):>7}{_spoken(full):>8}  {about}")
+    return "\n".join(lines)
 
 
 def _spoken(seconds: int) -> str:

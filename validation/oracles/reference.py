@@ -293,35 +293,35 @@ def _(mesh: Mesh, o: Array, d: Array) -> Met:
     first = corners[:, 1] - corners[:, 0]
     second = corners[:, 2] - corners[:, 0]
     whole = np.cross(first, second)
-    t = np.full(len(o), np.inf)
+    t, u, v = np.zeros((3, len(o)))
     face = np.zeros(len(o), int)
     step = max(1, BATCH // len(corner))
     for part in (slice(i, i + step) for i in range(0, len(o), step)):
         moment = np.cross(o[part], d[part])
         scale = -1 / (d[part] @ whole.T)
-        u = (moment @ second.T - d[part] @ np.cross(second, corner).T) * scale
-        v = -(moment @ first.T + d[part] @ np.cross(corner, first).T) * scale
+        along_first = (moment @ second.T - d[part] @ np.cross(second, corner).T) * scale
+        along_second = -(moment @ first.T + d[part] @ np.cross(corner, first).T) * scale
         far = _ahead((o[part] @ whole.T - dot(whole, corner)) * scale)
-        far[~((u >= 0) & (v >= 0) & (u + v <= 1))] = np.inf
-        t[part] = far.min(axis=1)
+        far[~((along_first >= 0) & (along_second >= 0) & (along_first + along_second <= 1))] = np.inf
         face[part] = far.argmin(axis=1)
+        hit = np.arange(len(far)), face[part]
+        t[part] = far[hit]
+        u[part] = along_first[hit]
+        v[part] = along_second[hit]
 
     def surface(k: Array) -> tuple[Array, Any]:
         """Normals, and the texels nearest to the points, as stored."""
-        f = face[k]
         normal = unit(whole[face[k]])
         if not mesh.material.texture:
             return normal, None
-        off = o[k] + t[k, None] * d[k] - corner[f]
-        weights = [dot(np.cross(off, second[f]), whole[f]), dot(np.cross(first[f], off), whole[f])]
-        weights /= dot(whole[f], whole[f])
-        uv = np.asarray(mesh.uvs, float)[mesh.faces][f]
-        u, v = np.clip(np.einsum("cn,nci->in", [1 - sum(weights), *weights], uv), 0, 1)
+        weights = [1 - u[k] - v[k], u[k], v[k]]
+        uvs = np.asarray(mesh.uvs, float)[mesh.faces[face[k]]]
+        across, down = np.clip(np.einsum("cn,nci->in", weights, uvs), 0, 1)
         with Image.open(str(mesh.material.texture)) as picture:
             texels = np.asarray(picture.convert("RGB")) / 255
         rows, columns = texels.shape[:2]
-        row = (v * (rows - 1) + 0.5).astype(int)
-        column = (u * (columns - 1) + 0.5).astype(int)
+        row = (down * (rows - 1) + 0.5).astype(int)
+        column = (across * (columns - 1) + 0.5).astype(int)
         return normal, texels[row % rows, column % columns]
 
     return t, surface

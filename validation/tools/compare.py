@@ -219,7 +219,7 @@ def _p_of_means(difference: Array) -> float:
     side = -(-max(difference.shape) // BLOCKS)
     rows = difference[1:] * difference[:-1]
     columns = difference[:, 1:] * difference[:, :-1]
-    near = np.concatenate([rows.ravel(), columns.ravel()])
+    near = np.append(rows, columns)
     both = np.sign(near)
     shared = both.sum() > 3 * np.count_nonzero(both) ** 0.5
     alike = max(near.sum(), 0) / 2 / (difference**2).sum() if shared else 0
@@ -231,7 +231,7 @@ def _p_of_means(difference: Array) -> float:
     count = cell_sums(np.ones_like(picture), side)
     square = cell_sums(picture**2, side)
     blocks = cell_sums(picture, side)
-    signs = np.random.default_rng(0).integers(2, size=(FLIPS, *blocks.shape[1:])) * 2.0 - 1
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (FLIPS, *blocks.shape[1:]))
     blocks = np.concatenate([blocks, signs * blocks])
     least = np.inf
     for size in (max(CELL // side, CELL // 2), BLOCKS):

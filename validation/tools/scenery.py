@@ -55,7 +55,7 @@ def sensor(
     }
 
 
-def ball_scene(bsdf: Node, *, size: int = 96) -> mi.Scene:
+def ball_scene(bsdf: Node, *, size: int) -> mi.Scene:
     """A ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size``."""
     film = {"width": size, "height": size * 3 // 4, "pixel_format": "rgb"}
     return mi.load_dict(
