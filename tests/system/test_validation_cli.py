@@ -57,8 +57,8 @@ def good(study: Study, *, quick: bool) -> None:
     study.goal("ratio of seconds", 1.4, 1.3, "taken in turn", interval=(1.35, 1.5))
     study.goal("another ratio", 1.2, 1.3, "taken in turn", interval=(1.1, 1.5))
     rows = [["Ag", 0.123456789, 2], ["Au", np.float32(2e-5), quick], ["Cu", INFINITE, 12345678]]
-    study.table("errors", "Errors", ["metal", "error", "n"], rows)
-    study.table("answer", "What to do", ["setting"], [["aa=2"]], first=True)
+    study.records("errors", "Errors", [dict(zip(("metal", "error", "n"), row, strict=True)) for row in rows])
+    study.records("answer", "What to do", [{"setting": "aa=2"}], first=True)
     study.picture("curve", "A curve", figure, "rises")
     study.picture("ball", "A ball", np.full((4, 5, 3), 0.25))
     assert list(study.each("work", [1, 2])) == [1, 2]
@@ -178,7 +178,7 @@ def test_interrupt_leaves_the_report_as_it_was(validate, tmp_path):
 @pytest.mark.parametrize("wrong", [False, True])
 def test_long_lists_are_folded_unless_a_bound_is_missed(validate, wrong):
     def many(study: Study, *, quick: bool) -> None:
-        study.table("long", "Long", ["i"], [[i] for i in range(40)])
+        study.records("long", "Long", [{"i": i} for i in range(40)])
         for i in range(40):
             study.at_most(f"bound {i}", float(wrong and i == 3), 0, "a reason")
 

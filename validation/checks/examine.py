@@ -61,13 +61,12 @@ class Check:
     def study(self) -> Study:
         """The findings in the form that pages are made of."""
         study = Study(self.subject, f"{self.subject}, {self.variant}", seconds=self.seconds)
-        columns = ["law", "verdict", "note", "the worst case, to run by itself"]
         rows = []
         for law in self.laws.values():
             study.bounds += [replace(part, name=f"{law.name}: {part.name}") for part in law.parts]
-            snippet = "" if law.holds else law.snippet
-            rows.append([law.name, law.verdict, law.skipped or law.note, snippet])
-        study.table("laws", "Laws", columns, rows, first=True)
+            row = {"law": law.name, "verdict": law.verdict, "note": law.skipped or law.note}
+            rows.append(row | {"the worst case, to run by itself": "" if law.holds else law.snippet})
+        study.records("laws", "Laws", rows, first=True)
         return study
 
     def save(self, folder: str | Path) -> None:

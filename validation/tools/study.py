@@ -118,12 +118,6 @@ class Study:
         """Show whether a time or a ratio of times is within a limit; a busy machine must fail no study."""
         self.goals.append(Bound(name, float(measured), float(limit), note=note, interval=interval))
 
-    def table(
-        self, name: str, title: str, columns: Sequence[str], rows: Any, note: str = "", *, first: bool = False
-    ) -> None:
-        """Add a table, which is also written as CSV; ``first``: an answer, shown before the pictures."""
-        self.tables[name] = {"title": title, "columns": columns, "rows": rows, "note": note, "first": first}
-
     def records(
         self,
         name: str,
@@ -133,8 +127,13 @@ class Study:
         *,
         first: bool = False,
     ) -> None:
-        """Add a table of rows that name their values: the columns are those of the first row."""
-        self.table(name, title, list(rows[0]), [list(row.values()) for row in rows], note, first=first)
+        """Add a table of rows that name their values: the columns are those of the first row.
+
+        It is also written as CSV; ``first``: an answer, shown before the pictures.
+        """
+        columns = [*rows[0]] if rows else []
+        values = [[*row.values()] for row in rows]
+        self.tables[name] = {"title": title, "columns": columns, "rows": values, "note": note, "first": first}
 
     def picture(self, name: str, title: str, content: Any, caption: str = "") -> None:
         """Add a linear picture [H, W, 3] or a matplotlib figure, with a caption that says what it shows."""
