@@ -32,13 +32,7 @@ QUICK = (("matte", "large"), ("glass", "small"))
 
 def scene(ball: str, lamp: str) -> Any:
     """A ball on a floor under a lamp and a faint sky."""
-    radius = LAMPS[lamp]
-    light = {"type": "area", "radiance": {"type": "rgb", "value": 4 / radius**2}}
-    return load_room(
-        SIZE,
-        ball={"type": "sphere", "center": [0, 0.9, 0], "radius": 0.8, "bsdf": BALLS[ball]},
-        lamp={"type": "sphere", "center": [1.5, 4, 1], "radius": radius, "emitter": light},
-    )
+    return load_room(SIZE, bsdf=BALLS[ball], radius=LAMPS[lamp])
 
 
 def run(study: Study, *, quick: bool) -> None:

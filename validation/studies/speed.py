@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
@@ -98,16 +97,6 @@ def _render(nodes: Nodes, **options: Any) -> Run:
     return partial(mrt.render, load(nodes), **renders.ONE_RAY | options)
 
 
-def _by_mitsuba(nodes: Nodes, integrator: Nodes | None, spp: int) -> Run:
-    scene = load(nodes)
-    chosen = mi.load_dict(integrator) if integrator else scene.integrator()
-
-    def render() -> np.ndarray:
-        return np.array(mi.render(scene, integrator=chosen, spp=spp))
-
-    return render
-
-
 def against_mitsuba(extent: Extent) -> Iterator[Pair]:
     """Yield this project's plugins against Mitsuba's own, in the report's scenes.
 
@@ -128,7 +117,7 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
         own = nodes(number, flavor)
         del own["sky"]  # direct would sample it, mrt_whitted does not
         lights = {name: node for name, node in nodes(number).items() if name.startswith("light_")}
-        return _by_mitsuba(own | lights, integrator, extent.spp)
+        return renders.by_mitsuba(own | lights, extent.spp, integrator)
 
     def of(bsdf: Callable[[float], Nodes], number: int) -> Run:
         """The scene of Mitsuba's plugins, with a material in place of ``roughplastic``."""
@@ -136,7 +125,7 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
         keep = "specular_reflectance"
         plastics = {n: m for n, m in stock.items() if isinstance(m, dict) and m["type"] == "roughplastic"}
         metals = {name: bsdf(node["alpha"]) | {keep: node[keep]} for name, node in plastics.items()}
-        return _by_mitsuba(stock | metals, None, extent.spp)
+        return renders.by_mitsuba(stock | metals, extent.spp)
 
     for n in extent.scenes:
         lights = sum(key.startswith("light_") for key in nodes(n))

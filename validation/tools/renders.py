@@ -118,10 +118,15 @@ def _prepared() -> Render:
     return mrt.prepare(_small(), **ONE_RAY)
 
 
-def _by_mitsuba() -> Render:
-    """Mitsuba's own way to a picture by the scene's integrator, ``mrt_whitted``."""
-    scene = _small()
-    return lambda: np.array(mi.render(scene, spp=1))
+def by_mitsuba(nodes: Nodes, spp: int, integrator: Nodes | None = None) -> Render:
+    """Mitsuba's own way to a picture, by the scene's integrator or another one."""
+    scene = load(nodes)
+    chosen = mi.load_dict(integrator) if integrator else scene.integrator()
+
+    def render() -> np.ndarray:
+        return np.array(mi.render(scene, integrator=chosen, spp=spp))
+
+    return render
 
 
 def _box(width: int, height: int) -> Nodes:
@@ -157,7 +162,7 @@ CASES["small, with an update"] = (100, _with_update)
 CASES["small, from its number"] = (100, lambda: partial(mrt.render, 3, **SMALL, **ONE_RAY))
 CASES["small, film"] = (100, _report(3, (64, 48), {"aamode": "none", "aa": 1}))
 CASES["small, filters"] = (50, _report(3, (64, 48), BLURRED))
-CASES["small, mi.render"] = (100, _by_mitsuba)
+CASES["small, mi.render"] = (100, lambda: by_mitsuba(mrt.scene_dict(3, **SMALL), 1))
 
 
 def seconds(name: str) -> float:

@@ -274,8 +274,19 @@ def stratified() -> Node:
 KINDS = ("calm", "texture", "lights", "gloss", "glass", "spot", "fog")
 
 
-def load_room(size: int, *, sampler: str = "independent", rfilter: str = "box", **others: Node) -> mi.Scene:
-    """A matte ball on a floor under a lamp and a faint sky; ``others`` add nodes or replace these."""
+def load_room(
+    size: int,
+    *,
+    sampler: str = "independent",
+    rfilter: str = "box",
+    bsdf: Node | None = None,
+    radius: float = 0.8,
+    **others: Node,
+) -> mi.Scene:
+    """A ball on a floor under a lamp and a faint sky; ``others`` add nodes or replace these.
+
+    ``bsdf``: of the ball, matte by default; ``radius``: of the lamp, whose power does not depend on it.
+    """
     view: Node = {"film": {"width": size, "height": size}}
     if "medium" in others:
         view["medium"] = others.pop("medium")
@@ -284,16 +295,11 @@ def load_room(size: int, *, sampler: str = "independent", rfilter: str = "box", 
         "integrator": {"type": "path"},
         "sensor": sensor([0, 2, 5], [0, 0.6, 0], rfilter, sampler, **view),
         "floor": _floor(_diffuse(0.5)),
-        "ball": _middle(_diffuse(0.5)),
-        "lamp": _lamp([1.5, 4, 1], 0.8, 6.25),
+        "ball": _ball([0, 0.9, 0], 0.8, bsdf or _diffuse(0.5)),
+        "lamp": _lamp([1.5, 4, 1], radius, 4 / radius**2),
         "sky": _sky(0.05),
     }
     return mi.load_dict(nodes | others)
-
-
-def _middle(bsdf: Node) -> Node:
-    """The ball in the middle of a room."""
-    return _ball([0, 0.9, 0], 0.8, bsdf)
 
 
 def load_kind(kind: str, size: int, sampler: str = "multijitter", rfilter: str = "box") -> mi.Scene:
@@ -306,9 +312,9 @@ def load_kind(kind: str, size: int, sampler: str = "multijitter", rfilter: str =
         "lights": {f"lamp{k}": _lamp(place, 0.05, 40) for k, place in enumerate(places)},
         "gloss": {
             "floor": _floor({"type": "roughconductor", "alpha": 0.1}),
-            "ball": _middle({"type": "roughplastic", "alpha": 0.1}),
+            "bsdf": {"type": "roughplastic", "alpha": 0.1},
         },
-        "glass": {"ball": _middle({"type": "dielectric"})},
+        "glass": {"bsdf": {"type": "dielectric"}},
         "spot": {"lamp": _spot(40)},
         "fog": {
             "integrator": {"type": "volpath", "max_depth": 5},
@@ -317,5 +323,5 @@ def load_kind(kind: str, size: int, sampler: str = "multijitter", rfilter: str =
             "medium": inside,
         },
     }
-    path = {"integrator": {"type": "path", "max_depth": 5}}
+    path: Node = {"integrator": {"type": "path", "max_depth": 5}}
     return load_room(size, sampler=sampler, rfilter=rfilter, **path | kinds[kind])
