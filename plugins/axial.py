@@ -85,7 +85,7 @@ class AxialMesh(mi.Mesh):
         mi.Mesh.parameters_changed(self, keys)
 
     def _follow(self, frame: Frame) -> None:
-        """Write positions and normals anew, differentiably with respect to what ``frame`` is made of."""
+        """Write positions and normals anew, with derivatives by the parameters of ``frame``."""
         frame = Frame(*map(mi.Vector3f, vars(frame).values()))
         vertices, _ = self.unit
         points = mi.Vector3f(vertices[:, :3].T)

@@ -8,9 +8,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from . import classes_of, is_known, plugin
+from . import classes_of, is_known
 from .kernel_plan import Mirror, SceneFacts
-from .lights import brightness
+from .lights import brightness, light_rows
 from .lobes import LOBES
 from .materials import has_mirror, is_mrt_bsdf, is_oriented, is_textured, material_rows
 from .parameters import ParameterError
@@ -24,7 +24,7 @@ LARGEST_MESH = 1e10
 
 
 class Reading:
-    """A snapshot of a scene and what is read of it, by part; ``kept`` spares reading a part again.
+    """A snapshot of a scene and the facts in it; ``kept`` holds those of parts that have not changed since.
 
     What the kernels may do in place of calling a plugin is known by its class: an ``MrtPlane`` has an
     equation, an ``AxialMesh`` or ``MrtGroup`` stands for quadrics, an ``MrtBSDF`` is a row of a table, and so
@@ -93,7 +93,7 @@ def _read_lights(
     """Return the lights, their rows where all have some, and the facts about them."""
     largest = {id(e): brightness(e) for e in snapshot.emitters}
     lights = [e for e in snapshot.emitters if not e.is_environment() and largest[id(e)] != 0]
-    rows = _light_rows(lights)
+    rows = light_rows(lights)
     environment = snapshot.environment
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
     surfaces = [largest[id(e)] for e in lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
@@ -109,21 +109,10 @@ def _read_lights(
     return lights, rows, facts
 
 
-def _light_rows(lights: list[mi.Emitter]) -> list[list[list[float]]] | None:
-    """Return the rows of the lights for a table, None where one has no place in it."""
-    kind = plugin("light").MrtLight
-    if not is_jit() or mi.is_spectral or not all(isinstance(light, kind) for light in lights):
-        return None
-    rows = [light.fixed_row() for light in lights]
-    return None if None in rows else rows
-
-
 def _read_materials(snapshot: Snapshot) -> tuple[list[np.ndarray], dict[str, Any]]:
     """Return the materials as rows of a table, none where they have no place in one, and the facts."""
     bsdfs = snapshot.bsdfs
-    outcome = material_rows(snapshot.shapes)
-    unmergeable = outcome if isinstance(outcome, str) else ""
-    rows = [] if isinstance(outcome, str) else outcome
+    rows, unmergeable = material_rows(snapshot.shapes)
     # Kernels leave out lobes by their flags; materials outside the table may have any
     flags = {lobe.flag for k, lobe in enumerate(LOBES, start=1) if any(row[k].any() for row in rows)}
     lobes = [(lobe.name, bool(unmergeable) or lobe.flag in flags) for lobe in LOBES]

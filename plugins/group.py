@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from .mesh_api import Placement, keep_apart, write_buffers
-from .parameters import ParameterError, choice, segments
+from .parameters import ParameterError, bitmap, choice, segments
 from .quadric_kinds import KINDS, QuadricTable
 
 # Kinds that a group may hold
@@ -45,7 +45,7 @@ class MrtGroup(mi.Mesh):
 
     def __init__(self, props: mi.Properties) -> None:
         kind = choice(props, "kind", CLOSED)
-        numbers = _table(props, "numbers", KINDS[kind].width).astype(np.float64)
+        numbers = _table(props, "numbers", 3 * KINDS[kind].points + 1).astype(np.float64)
         _check(numbers)
         attributes = {name: _table(props, name) for name in props if name.startswith("face_")}
         self.content = f"kind={kind}, objects={len(numbers)}"
@@ -72,9 +72,7 @@ class MrtGroup(mi.Mesh):
 
 def _table(props: mi.Properties, name: str, width: int | None = None) -> np.ndarray:
     """Return a bitmap parameter as float32 [n, width]."""
-    if name not in props or not isinstance(props[name], mi.Bitmap):
-        raise ParameterError(f'mrt_group: "{name}" must be a mi.Bitmap of an array [n, values]')
-    table = np.array(props[name])
+    table = bitmap(props, name, "of an array [n, values]")
     table = table.reshape(len(table), -1).astype(np.float32)
     if width is not None and table.shape[1] != width:
         given = table.shape[1]

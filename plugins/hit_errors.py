@@ -30,9 +30,9 @@ LEAST = 2.0**-12
 
 
 class HitErrors:
-    """The bounds for hits on Mitsuba's own shapes, by the shape that was hit.
+    """The bounds of hits, and the sizes of Mitsuba's own shapes that they depend on.
 
-    The shapes inside an instance are not of the scene's own: the largest size for them.
+    Shapes inside an instance are not the scene's own, and get the largest size.
     """
 
     def __init__(self, shapes: list[mi.Shape]) -> None:
@@ -50,13 +50,17 @@ class HitErrors:
         """Return the largest coordinate of the shape."""
         return mi.Float(0) if self.sizes is None else self.sizes(si, active)
 
-    def of_flat(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float | None:
-        """Return the bound at a hit on a flat shape; inf on a curved one, None where all are."""
+    def bound(self, si: mi.SurfaceInteraction3f, scale: mi.Float, active: mi.Bool) -> mi.Float:
+        """Return how far a hit may be off its surface, in scene units.
+
+        ``scale``: the largest coordinate of the shape that was hit, which may be another than Mitsuba's.
+        """
+        error = CURVED * dr.maximum(scale, dr.max(dr.abs(si.p)))
         if self.flat is None:
-            return None
+            return error
         row = self.flat(si, active)
         width = mi.Vector3f(row.x, row.y, row.z)
-        return FLAT * (dr.dot(dr.abs(si.n), dr.abs(si.p) + width) + row.w)
+        return dr.minimum(error, FLAT * (dr.dot(dr.abs(si.n), dr.abs(si.p) + width) + row.w))
 
 
 def _sizes_across(corners: np.ndarray) -> list[float]:

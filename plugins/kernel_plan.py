@@ -77,8 +77,8 @@ class KernelPlan:
     lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
     mirrors: bool  #: mirror reflections
     lobes: tuple[str, ...]  #: of the materials, by name
-    #: what multiplies a path's throughput (inf: it never ends for being too dim), and a light's share at a
-    #: hit, before they are compared with ``min_contribution``
+    #: factors of a path's throughput (inf: it never ends for being too dim), and of a light's share at a hit,
+    #: before these are compared with ``min_contribution``
     cut_off: tuple[float, float]
     bvh: bool  #: Mitsuba's ray queries
     coherent: bool  #: Embree's treatment of packets of like rays

@@ -12,8 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import is_known
-from .variants import Table, largest, pointer
+from . import is_known, plugin
+from .variants import Table, is_jit, largest, pointer
 
 
 def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
@@ -34,35 +34,42 @@ def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
     return ds
 
 
+def light_rows(lights: list[mi.Emitter]) -> list[list[list[float]]] | None:
+    """Return the ``fixed_row`` of each light, vectors of three; None where one has no place in a table."""
+    kind = plugin("light").MrtLight
+    if not is_jit() or mi.is_spectral or not all(isinstance(light, kind) for light in lights):
+        return None
+    rows = [light.fixed_row() for light in lights]
+    return None if None in rows else rows
+
+
 class Lights:
     """The lights of a scene as its kernels have them; ``form`` is that of the plan."""
 
-    def __init__(
-        self, lights: list[mi.Emitter], light_rows: list[list[list[float]]] | None, form: str
-    ) -> None:
+    def __init__(self, lights: list[mi.Emitter], rows: list[list[list[float]]] | None, form: str) -> None:
         self.unrolled = len(lights) if form == "unrolled" else 0  #: those with code of their own
         self.count = dr.opaque(mi.UInt32, len(lights)) if form in ("loop", "table") else None
-        self.called: Any = lights if light_rows is None else None
+        self.called: Any = lights if rows is None else None
         if form == "loop":
             self.called = pointer("Emitter", lights)
-        elif form != "none" and light_rows is not None:
+        elif form != "none" and rows is not None:
             self.kind_of = [type(light) for light in lights]
             #: the kinds that the kernel holds, and how many vectors a row of each has
-            self.kinds = dict(zip(self.kind_of, map(len, light_rows), strict=True))
+            self.kinds = dict(zip(self.kind_of, map(len, rows), strict=True))
             if form == "table":
                 kinds = list(self.kinds)
                 parts = np.zeros((1 + max(self.kinds.values()), len(lights), 3))
-                for k, row in enumerate(light_rows):
+                for k, row in enumerate(rows):
                     parts[0, k] = kinds.index(self.kind_of[k])
                     parts[1 : 1 + len(row), k] = row
                 self.parts = [Table(mi.Vector3f, part) for part in parts]
             else:
-                self.rows = [[dr.opaque(mi.Vector3f, part) for part in row] for row in light_rows]
+                self.rows = [[dr.opaque(mi.Vector3f, part) for part in row] for row in rows]
 
     def sample(
         self, light: Any, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.UnpolarizedSpectrum]:
-        """Return the direction from ``it`` to a light, by its number, and what arrives from it."""
+        """Return the direction from ``it`` to light number ``light``, and the light that arrives."""
         number: Any = None  # of the kind, where there are several
         if self.called is not None:
             called = self.called
@@ -87,8 +94,8 @@ class Lights:
 def brightness(emitter: mi.Emitter) -> float:
     """Return the largest radiance, irradiance or intensity of an emitter; inf where it is not known.
 
-    It is not known of what varies, of spectra in scalar variants, of what somebody else wrote in Python, and
-    where derivatives are wanted.
+    Not known are textures that vary, spectra in scalar variants, classes that somebody else wrote in Python,
+    and values whose derivatives are wanted.
     """
     if not is_known(emitter):
         return np.inf

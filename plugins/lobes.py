@@ -25,7 +25,7 @@ from .microfacet import (
 ALPHA_MIN = 1e-8
 ALPHA_MAX = 1e6
 
-# Directions that are nearer to the horizon count as below it: what divides by their cosines stays in float32
+# Directions nearer to the horizon count as below it, so that quotients by their cosines stay within float32
 COS_MIN = 1e-12
 
 # Indices of textures and of updates, whose values are not checked, are brought between these
@@ -62,8 +62,8 @@ class Pair:
 
 # A lobe has a name, the parameter that scales it with its default, the flag of its component among
 # ``mi.BSDFFlags`` and the names of the other parameters that it depends on. ``value`` is f cos θo, and
-# ``density`` that of its samples; ``sample`` draws a direction, and tan² of the angle of the half vector;
-# ``albedo`` is what it reflects of light from ``at.wi``, by which it is chosen
+# ``density`` that of its samples per solid angle; ``sample`` draws a direction, with tan² of the angle of the
+# half vector to z. ``albedo``, how much light from ``at.wi`` it reflects, decides how often it is drawn from
 
 
 class Diffuse:
@@ -119,7 +119,8 @@ class Specular:
             m = sample_beckmann_visible(wi, at.alpha, sample2, unit.sample_visible_11, mi.Vector3f)
         else:
             m = sample_beckmann(at.alpha, sample2.x, sample2.y, mi.Vector3f)
-        # The drawn normal *is* the half vector: of a narrow lobe, wi + wo has lost what sets it apart from n
+        # The drawn normal *is* the half vector: in a narrow lobe, wi + wo has lost the digits in which it
+        # differs from n
         return mi.reflect(wi, m), tan2_theta(m)
 
     def albedo(self, at: Lobes) -> mi.UnpolarizedSpectrum:
@@ -179,7 +180,7 @@ class Lobes:
 
     @cached_property
     def mirror_reflectance(self) -> mi.UnpolarizedSpectrum:
-        """k_s F(θi): what a perfect mirror in place of the lobe would reflect; 0 from behind."""
+        """k_s F(θi), the reflectance of a perfect mirror in place of the lobe; 0 from behind."""
         above = self.wi.z > COS_MIN
         sin2_theta = dr.square(self.wi.x) + dr.square(self.wi.y)
         fresnel = self.fresnel(dr.select(above, self.wi.z, 1), dr.select(above, sin2_theta, 0))

@@ -19,8 +19,9 @@ from .table import names_in
 from .variants import ByShape, is_jit, varies
 
 
-def material_rows(shapes: Sequence[mi.Shape]) -> list[np.ndarray] | str:
-    """Return the ``fixed_row`` of the material of each shape, or why they have no place in one table."""
+def material_rows(shapes: Sequence[mi.Shape]) -> tuple[list[np.ndarray], str]:
+    """Return the ``fixed_row`` of the material of each shape, and ""; or none of them, and the reason why
+    they have no place in one table."""
     bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
     # Of the class itself: one derived from it may have other lobes
     mergeable = bool(bsdfs) and {type(b) for b in bsdfs.values()} == {plugin("bsdf").MrtBSDF}
@@ -35,7 +36,9 @@ def material_rows(shapes: Sequence[mi.Shape]) -> list[np.ndarray] | str:
     reasons = [why for why, holds in obstacles.items() if holds]
     rows = {} if reasons else {key: bsdf.fixed_row() for key, bsdf in bsdfs.items()}
     reasons += [row for row in rows.values() if isinstance(row, str)]
-    return reasons[0] if reasons else [rows[id(s.bsdf())] for s in shapes]
+    if reasons:
+        return [], reasons[0]
+    return [rows[id(s.bsdf())] for s in shapes], ""
 
 
 class MaterialTable:

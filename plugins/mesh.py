@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from .mesh_api import Placement, write_buffers
-from .parameters import ParameterError
+from .parameters import ParameterError, bitmap
 
 # What vertices may have, and numbers for each in the bitmap: so many are used, or more given
 _EXTRAS = {"texcoords": (2, 3), "normals": (3,)}
@@ -73,11 +73,7 @@ class MrtMesh(mi.Mesh):
 
 
 def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:
-    if name not in props or not isinstance(props[name], mi.Bitmap):
-        raise ParameterError(
-            f'mrt_mesh: "{name}" must be a mi.Bitmap of one row; write mi.Bitmap(array[np.newaxis])'
-        )
-    array = np.array(props[name])
+    array = bitmap(props, name, "of one row; write mi.Bitmap(array[np.newaxis])")
     if array.ndim != 3 or array.shape[0] != 1 or array.shape[2] not in widths:
         wanted = " or ".join(f"[1, N, {width}]" for width in widths)
         raise ParameterError(f'mrt_mesh: "{name}" has the shape {array.shape}, but must have {wanted}')

@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     import mitsuba as mi
 
-# Mitsuba computes in float32; what is larger would become infinite there, and what is smaller zero
+# Mitsuba computes in float32, where larger numbers would become infinite, and smaller ones zero
 LARGEST = 3.4e38
 SMALLEST = 1.2e-38
 
@@ -103,6 +103,13 @@ def transform(props: mi.Properties, name: str) -> np.ndarray:
     if "Transform" not in type(value).__name__:  # it has several classes, and arrays have any attribute
         _fail(props, name, value, "a transform")
     return np.array(value.matrix, np.float64)
+
+
+def bitmap(props: mi.Properties, name: str, form: str) -> np.ndarray:
+    """Return a bitmap as an array [rows, columns, channels]; ``form`` is the one it must have, in words."""
+    if name not in props or type(props[name]).__name__ != "Bitmap":
+        raise ParameterError(f'{props.plugin_name()}: "{name}" must be a mi.Bitmap {form}')
+    return np.array(props[name])
 
 
 def spectrum(

@@ -2,8 +2,8 @@
 
 A ray to or from the point looks up the cell that it comes through and tests the objects listed there, one or
 two of hundreds, in place of a walk down a tree. Each list begins with the object nearest to the point, and a
-ray leaves it where all others are beyond its end, or behind its hit. The lists are conservative: objects are
-taken for wider by what float32 loses; what a ray meets is for the test of each to say.
+ray leaves it where all others are beyond its end, or behind its hit. The lists are conservative: objects
+count as wider by the errors of float32, and the test of each decides whether a ray meets it.
 Source: Haines and Greenberg, "The Light Buffer: A Shadow-Testing Accelerator", IEEE Computer Graphics and
 Applications 6(9), 1986.
 """
@@ -37,7 +37,7 @@ class PointBuffer:
     """Lists of objects for each of some points, in ``size`` x ``size`` cells of each face of its cube.
 
     The points lie at ``places`` [m, 3]; the objects, by their ``numbers`` [n], in ``boxes`` [n, 2, 3] or,
-    with ``balls``, in the balls inside these. The cells of a face divide what the objects take up of it.
+    with ``balls``, in the balls inside these. The cells of a face divide the part of it that they cover.
     """
 
     def __init__(
@@ -46,8 +46,8 @@ class PointBuffer:
         faces = 6 * len(places)
         size = 2 ** int(np.ceil(np.log2(2 * np.sqrt(len(boxes)))))
         extent = float(max(np.abs(places).max(), np.abs(boxes).max()))
-        # The test of spheres in float32 also finds what passes by, the farther a ray starts, and is to be
-        # obeyed
+        # In float32 the test of a sphere also finds rays that pass close by, the more so the farther away
+        # they start; its answer counts, so the lists hold these as well
         middle = boxes.mean(axis=1)
         radius = 0.5 * np.diff(boxes, axis=1)[:, 0].min(axis=1)
         farthest = np.linalg.norm(middle - places[:, None], axis=2) + np.ptp(middle, axis=0).max()
@@ -80,7 +80,7 @@ class PointBuffer:
         cell = row * size + column
         order = np.lexsort((near[pair], cell))
         counts = np.bincount(cell, minlength=faces * size**2)
-        ends = np.cumsum(counts + (counts > 0))  # of each list, after what ends it: an object at infinity
+        ends = np.cumsum(counts + (counts > 0))  # ends of the lists; each closes with an object at infinity
         lists = np.full((ends[-1] + 1, 2), np.inf, np.float32)
         listed = np.ones(len(lists), bool)
         listed[ends[counts > 0] - 1] = listed[-1] = False

@@ -1,8 +1,8 @@
 """The kinds of quadrics that ``mrt_whitted`` traces exactly, a class of pure functions each, and their table.
 
 Everything works in float32 and float64, on scalars, Dr.Jit arrays and lists of columns alike (see
-``intersect``). ``points`` place a quadric, followed by a radius: ``width`` numbers. ``parts`` are of its
-surface, ``ends`` what is at both ends of its axis.
+``intersect``). The numbers of a quadric are those of its points, as many as ``points``, and a radius.
+``parts`` are those of its surface, ``ends`` the shapes at both ends of its axis.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from .intersect import BASE, LATERAL, TOP, Frame, intersect_cone, intersect_cylinder, intersect_sphere
 
-# What the ends of a quadric are, by the squared semi-axes of their unit frame that span them
+# The shapes at the ends of a quadric, by the squares of their semi-axes in the unit frame
 POINT = (0, 0, 0)
 DISC = (1, 1, 0)
 BALL = (1, 1, 1)
@@ -32,7 +32,6 @@ class Sphere:
     """A sphere of radius 1 around 0."""
 
     points = 1
-    width = 4
     parts = (LATERAL,)
     ends = (BALL, BALL)
     closed = True
@@ -92,12 +91,11 @@ class Sphere:
 class Axial:
     """A solid of revolution along z from 0 to 1: a side, and a disc of radius 1 at each end that is one.
 
-    ``slope``: what the radius of the side grows by from one end to the other. Without ``capped`` it is open.
+    ``slope``: how much the radius of the side grows from z = 0 to z = 1. Without ``capped`` it is open.
     Texture coordinates: u = azimuth / 2π in [0, 1), v = 1 - z on the side, the unit square around a disc.
     """
 
     points = 2
-    width = 7
     slope = 0
     parts: tuple[int, ...] = (LATERAL, BASE)
     ends = (DISC, DISC)

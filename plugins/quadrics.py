@@ -99,7 +99,7 @@ class Quadrics:
         *,
         tangents: bool = False,
     ) -> mi.Float:
-        """Make ``si`` the interaction of ``ray`` with what ``intersect`` found.
+        """Make ``si`` the interaction of ``ray`` with the ``hit`` that ``intersect`` found.
 
         Returns the size of its coordinates, the largest number in the quadric's box; ``scale`` elsewhere.
         """

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from .facts import Reading
-from .hit_errors import CURVED, HitErrors
+from .hit_errors import HitErrors
 from .kernel_plan import KernelPlan
 from .lights import Lights
 from .lobes import LOBES, Pair
@@ -44,29 +44,32 @@ class Hit:
 class SceneData:
     """The data of the kernels for a scene, as a plan wants them, and its ray queries.
 
-    ``kept`` spares making what depends on parts of the scene that have not changed.
+    ``kept`` holds the data made of parts of the scene that have not changed since.
     """
 
-    def __init__(self, reading: Reading, plan: KernelPlan, kept: Kept) -> None:
+    def __init__(self, scene: mi.Scene, reading: Reading, plan: KernelPlan, kept: Kept) -> None:
         now = reading.snapshot
+        self.scene = scene
         self.plan = plan
         self.facts = reading.facts
         self.environment = now.environment
         self._kept = kept
         self.known = now.material_part.known and now.light_part.known
         self._form = form = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
-        # The shapes by who traces them; ``bvh``: a scene of those that only Mitsuba can, or None for all
+        # The shapes by who traces them; ``others``: a scene of those that only Mitsuba can, or None for all
         traced = kept("traced", form, _trace, reading, plan)
-        self.bvh, self.planes, self.quadrics, self.errors, self.spheres = traced
+        others, self.planes, self.quadrics, self.errors, self.spheres = traced
+        self.bvh = others or scene
         lit = now.light_part, plan.lights
         self.lights = kept("lights", lit, Lights, reading.lights, reading.light_rows, plan.lights)
-        # Lists of what may be in the way of the lights, with what tests it
+        # Lists of the objects that may block each light, with the objects themselves, which test rays
         things = [thing for thing in (self.quadrics, self.spheres) if thing is not None and plan.buffers]
         places = np.array([row[0] for row in reading.light_rows or ()])
         self.buffers = kept("buffers", (now.light_part, plan.buffers, *form), _buffers, places, things)
-        seen = [self.quadrics] if plan.eye else []
-        around = kept("eye", (now.eye, plan.eye, *form), _buffers, np.array([now.eye]), seen)
-        self.eye = around[0][0] if around else None
+        self.eye: PointBuffer | None = None
+        if plan.eye:
+            around = kept("eye", (now.eye, *form), _buffers, np.array([now.eye]), [self.quadrics])
+            self.eye = around[0][0]
         self.merged: MaterialTable | None = None
         if plan.merged:
             of_materials = now.shape_part, now.material_part
@@ -78,7 +81,7 @@ class SceneData:
         self.ray_flags |= +mi.RayFlags.UV if plan.textures else 0
         self.ray_flags |= +mi.RayFlags.ShadingFrame if plan.shading_frames else 0
 
-    def arrays(self, scene: mi.Scene) -> list[Any] | None:
+    def arrays(self) -> list[Any] | None:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
         plan = self.plan
         sky = self.environment
@@ -88,15 +91,13 @@ class SceneData:
         tabled = tabled and (plan.spheres == "table" or not plan.bvh)
         if not tabled or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
             return None
-        rays = self._kept("rays", self._form, _ray_arrays, self.bvh or scene) if plan.bvh else []
+        rays = self._kept("rays", self._form, _ray_arrays, self.bvh) if plan.bvh else []
         own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged]
         return [*_arrays_in([*own, self.buffers, self.eye]), *rays, self.path_limit, sky]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
-    def intersect(
-        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, eye: PointBuffer | None = None
-    ) -> Hit:
+    def intersect(self, ray: mi.Ray3f, active: mi.Bool, eye: PointBuffer | None = None) -> Hit:
         """Return the nearest hit among Mitsuba's shapes, the quadrics and the analytic planes."""
         plan = self.plan
         t, plane, on_plane = self.planes.intersect(ray, active)
@@ -106,9 +107,9 @@ class SceneData:
         found = mi.Bool(False)
         scale = mi.Float(0)  # size of the coordinates of what is hit
         if plan.bvh:
-            pi = (self.bvh or scene).ray_intersect_preliminary(ray, plan.coherent, active)
+            pi = self.bvh.ray_intersect_preliminary(ray, plan.coherent, active)
             found = active & pi.is_valid()
-            differentiable = scene.shapes_grad_enabled() or dr.grad_enabled(ray)
+            differentiable = self.scene.shapes_grad_enabled() or dr.grad_enabled(ray)
             if plan.spheres == "table" and not differentiable:
                 si, scale = self.spheres.interaction(pi, ray, found)
             else:
@@ -116,30 +117,24 @@ class SceneData:
                 if self.spheres is not None:
                     self.spheres.put_back(si, found)
                 scale = self.errors.size(si, found)
-        flat = self.errors.of_flat(si, found)
         if self.quadrics is not None:
             reach = dr.select(found, si.t, ray.maxt)
             nearer = mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths)
             quadric = self.quadrics.intersect(nearer, active, eye)
             closer = active & (quadric[0] < reach)
             scale = self.quadrics.put_into(si, ray, quadric, closer, scale, tangents=plan.tangents)
-            flat = None if flat is None else dr.select(closer, dr.inf, flat)
             found = found | closer
         if plan.planes:
             on_plane = but_not(on_plane, found)
             scale = self.planes.put_into(si, ray, plane, on_plane, scale, tangents=plan.tangents)
-            flat = None if flat is None else dr.select(on_plane, dr.inf, flat)
             found = found | on_plane
         si.sh_frame = _frame_along(si) if plan.tangents else mi.Frame3f(si.sh_frame.n)
         si.wi = si.to_local(-ray.d)
         si.time = ray.time
         si.wavelengths = ray.wavelengths
-        error = CURVED * dr.maximum(scale, dr.max(dr.abs(si.p)))
-        return Hit(si, found, error if flat is None else dr.minimum(error, flat))
+        return Hit(si, found, self.errors.bound(si, scale, found))
 
-    def occluded(
-        self, scene: mi.Scene, hit: Hit, light: Any, ds: mi.DirectionSample3f, active: mi.Bool
-    ) -> mi.Bool:
+    def occluded(self, hit: Hit, light: Any, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Bool:
         """Return whether anything blocks the segment from ``hit`` to the sample ``ds`` of a light."""
         o = self._off_surface(hit, ds.d)
         to_light = ds.p - o
@@ -155,7 +150,7 @@ class SceneData:
         if self.buffers:
             return blocked
         if self.plan.bvh:
-            blocked |= (self.bvh or scene).ray_test(ray, self.plan.coherent, but_not(active, blocked))
+            blocked |= self.bvh.ray_test(ray, self.plan.coherent, but_not(active, blocked))
         if self.quadrics is not None:
             blocked |= self.quadrics.occluded(ray, but_not(active, blocked))
         return blocked
@@ -224,7 +219,8 @@ def _trace(reading: Reading, plan: KernelPlan) -> tuple:
 
 
 def _buffers(places: np.ndarray, things: list[Any]) -> list[tuple[PointBuffer, Any]]:
-    """Return lists of things as seen from places, by kind, with what tests them."""
+    """Return for each of ``things``, such as ``Spheres``, lists of its objects as seen from places [m, 3],
+    and the thing itself."""
     return [(PointBuffer(places, *thing.boxes()), thing) for thing in things]
 
 
@@ -289,7 +285,7 @@ def _ray_arrays(scene: mi.Scene) -> list[Any]:
 
 
 def _arrays_in(value: Any) -> list[Any]:
-    """Return the arrays in objects of this package and in what they hold."""
+    """Return the arrays in a value, with those inside containers and objects of this package."""
     if isinstance(value, type):
         return []
     if dr.is_array_v(value):

@@ -140,11 +140,11 @@ class Spheres:
         # To the last bit, which Mitsuba's boxes do not have
         centers = numbers[:, 1::2]
         radii = np.linalg.norm(numbers[:, ::2], axis=1)[:, None]
-        self.balls = Table(mi.Vector4f, np.column_stack([centers, radii]).tolist())
+        self.balls = Table(mi.Vector4f, np.column_stack([centers, radii]))
         return np.stack([centers - radii, centers + radii], axis=1), np.arange(len(radii)), True
 
     def block(self, index: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
-        """Return whether a sphere is in the way of a ray: to the bit what Mitsuba says."""
+        """Return whether a sphere blocks a ray, which Mitsuba answers the same to the bit."""
         row = self.balls(index, mi.Bool(True))
         o = ray.o - mi.Point3f(row.x, row.y, row.z)
         a = dr.squared_norm(ray.d)

@@ -112,7 +112,7 @@ class Tree:
 
 
 def _to_next(node: mi.UInt32, waiting: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-    """Return the next child that waits, and what waits then; node 0 if none does."""
+    """Return the next child that waits, and the bits of those that wait after it; node 0 if none does."""
     levels = dr.tzcnt(waiting)
     done = waiting == 0
     node = dr.select(done, 0, (node >> levels) ^ 1)

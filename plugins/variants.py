@@ -1,5 +1,5 @@
-"""Differences between Mitsuba's scalar and vectorised variants: numbers and objects by index or by shape, and
-what Mitsuba's objects do not reveal."""
+"""Differences between Mitsuba's scalar and vectorised variants, tables of numbers by index or by shape, and
+facts that Mitsuba's objects do not state."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def put_where(where: mi.Bool, si: mi.SurfaceInteraction3f, **fields: object) -> 
 def varies(value: object) -> bool:
     """Return whether a value is a texture that may vary over a surface.
 
-    ``mesh_attribute`` denies it, and what somebody else wrote in Python need not say so.
+    ``mesh_attribute`` denies it, and a class that somebody else wrote in Python need not say so.
     """
     if not isinstance(value, mi.Texture):
         return False
@@ -76,7 +76,7 @@ def largest(texture: mi.Texture) -> float:
 
 
 def text_of(thing: object) -> str:
-    """Return what an object says of itself; the name of its class where that, in Python, says nothing."""
+    """Return an object's own description, or the name of its class where one in Python has none."""
     try:
         return str(thing)
     except RuntimeError:  # its to_string, or that of something inside it, is missing

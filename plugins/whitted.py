@@ -22,8 +22,8 @@ from .scene_data import Hit, SceneData
 from .snapshot import Kept, Snapshot
 from .variants import but_not, construct_quietly, largest
 
-# A sixteenth of a step of an 8-bit picture: what many cut paths add up to stays below half a step, and on
-# average over the report's scenes below 1e-5
+# A sixteenth of a step of an 8-bit picture: the sum of many cut paths stays below half a step, and on average
+# over the report's scenes below 1e-5
 MIN_CONTRIBUTION = 1 / 16 / 255
 
 OUTLINES = (
@@ -34,7 +34,7 @@ OUTLINES = (
 
 @dataclass
 class Trace:
-    """Radiance of a bundle of camera rays, and what fell out of computing it."""
+    """Radiance of a bundle of camera rays, and by-products."""
 
     radiance: mi.UnpolarizedSpectrum
     direct: mi.UnpolarizedSpectrum  # the part of it that needs no mirror ray
@@ -163,7 +163,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             self._warned = True
             mi.Log(mi.LogLevel.Warn, OUTLINES)
         reading = Reading(self._snapshot, self._made)
-        return SceneData(reading, plan or self.kernel_plan(reading.facts), self._made)
+        return SceneData(scene, reading, plan or self.kernel_plan(reading.facts), self._made)
 
     # ------------------------------------------- Tracing -----------------------------------------------
 
@@ -175,17 +175,17 @@ class MrtWhitted(mi.SamplingIntegrator):
         active: mi.Bool = True,
         data: SceneData | None = None,
     ) -> Trace:
-        """Return the radiance along ``ray`` and its by-products; what is not read from it is not computed.
+        """Return the radiance along ``ray`` and by-products; Dr.Jit computes only those that are read.
 
-        ``data``: what ``prepare`` returned for the scene as it is; without, it is called.
+        ``data``: from ``prepare``, which is called without it, for the scene as it is now.
         """
         data = self.prepare(scene) if data is None else data
 
         def follow(s: dict, eye: PointBuffer | None = None) -> tuple[dict, Hit]:
             """Trace the next ray of each path."""
-            hit = data.intersect(scene, s["ray"], s["active"], eye)
+            hit = data.intersect(s["ray"], s["active"], eye)
             radiance, shadow_rays, reflectance, cost = self._shade(
-                data, scene, s["sampler"], s["ray"], hit, s["throughput"], s["active"]
+                data, s["sampler"], s["ray"], hit, s["throughput"], s["active"]
             )
             # Finite, as an infinite one times no light would be NaN
             throughput = dr.minimum(s["throughput"] * reflectance, LARGEST)
@@ -211,7 +211,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             "radiance": mi.UnpolarizedSpectrum(0),  # light found so far
             "throughput": mi.UnpolarizedSpectrum(1),  # product of the mirror reflectances along the path
             "ray": ray,  # the next to be traced
-            "depth": mi.UInt32(0),  # what the bounces have cost so far
+            "depth": mi.UInt32(0),  # cost of the bounces so far
             "bounces": mi.UInt32(0),  # mirror rays traced
             "shadow_rays": mi.UInt32(0),  # shadow rays traced
             "active": mi.Bool(active),  # paths that go on
@@ -241,7 +241,6 @@ class MrtWhitted(mi.SamplingIntegrator):
     def _shade(
         self,
         data: SceneData,
-        scene: mi.Scene,
         sampler: mi.Sampler,
         ray: mi.Ray3f,
         hit: Hit,
@@ -249,7 +248,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         active: mi.Bool,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32]:
         """Return the light that leaves ``hit`` back along ``ray``, or the sky; the number of shadow rays; and
-        of the mirror ray, the reflectance and what it takes from the bounce budget.
+        the reflectance of the mirror ray and its cost in the bounce budget.
 
         ``throughput`` is that of the path up to ``hit``.
         """
@@ -263,7 +262,7 @@ class MrtWhitted(mi.SamplingIntegrator):
 
         # A branch, because packets whose rays all miss are many
         state = hit, throughput, sampler if data.plan.random else None
-        shade = partial(self._shade_surface, data, scene)
+        shade = partial(self._shade_surface, data)
         radiance, *others, _ = dr.if_stmt(state, hit.found, shade, pass_by, label="surface")
         if data.plan.sky != "none":
             si = dr.zeros(mi.SurfaceInteraction3f)
@@ -277,7 +276,6 @@ class MrtWhitted(mi.SamplingIntegrator):
     def _shade_surface(
         self,
         data: SceneData,
-        scene: mi.Scene,
         hit: Hit,
         throughput: mi.UnpolarizedSpectrum,
         sampler: mi.Sampler,
@@ -286,15 +284,15 @@ class MrtWhitted(mi.SamplingIntegrator):
         si = hit.si
         radiance = mi.UnpolarizedSpectrum(0)
         shadow_rays = mi.UInt32(0)
-        emitter = si.emitter(scene, hit.found) if plan.emission else None
+        emitter = si.emitter(data.scene, hit.found) if plan.emission else None
         if emitter is not None:  # as it is of most surfaces in scalar variants
             radiance += mi.unpolarized_spectrum(emitter.eval(si, hit.found))
 
         def add(
             lights: Sequence[Any], radiance: Any, shadow_rays: Any, sampler: mi.Sampler, mirror: bool
         ) -> tuple:
-            """Add what some lights contribute, and the shadow rays traced for them; return the sums, and the
-            mirror reflectance and its index of refraction, evaluated in the same call."""
+            """Add the contributions of some lights, and the shadow rays traced for them. Return both sums,
+            and the mirror reflectance and its index of refraction, which come from the same call."""
             samples = []
             wos = []
             facing = []  # is the light on the lit side
@@ -313,7 +311,7 @@ class MrtWhitted(mi.SamplingIntegrator):
                     value = dr.clip(value, 0, 1)
                 share = dr.max(dr.abs(throughput * value))
                 traced = lit & (share * plan.cut_off[1] > self.min_contribution)
-                visible = but_not(lit, data.occluded(scene, hit, light, ds, traced))
+                visible = but_not(lit, data.occluded(hit, light, ds, traced))
                 radiance = radiance + dr.select(visible, value, 0)
                 shadow_rays = shadow_rays + dr.select(traced, mi.UInt32(1), mi.UInt32(0))
             return radiance, shadow_rays, *of_mirror

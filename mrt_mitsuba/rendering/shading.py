@@ -173,7 +173,7 @@ class Shader:
 
     def read(self) -> list[Any] | None:
         """All that the kernels of ``values`` read; None where they may read anything."""
-        arrays = None if self._data is None else self._data.arrays(self.scene)
+        arrays = None if self._data is None else self._data.arrays()
         sky = getattr(self.integrator, "sky", None)
         if arrays is None or (sky is not None and not all(map(is_known, mi.traverse(sky).hierarchy))):
             return None

@@ -72,8 +72,8 @@ def test_a_parameter_is_used_or_refused(row, name):
 def test_reasons_name_the_plugins_of_the_table():
     assert names_in("materials") == "mrt_bsdf"
     assert "mrt_light" in names_in("lights").split(", ")
-    row = material_rows([mi.load_dict({"type": "sphere"})])
-    assert row == "a material other than mrt_bsdf"
+    rows = material_rows([mi.load_dict({"type": "sphere"})])
+    assert rows == ([], "a material other than mrt_bsdf")
 
 
 def test_lobes_may_share_a_flag(monkeypatch):
@@ -111,9 +111,9 @@ def test_a_lobe_is_left_out_only_with_all_of_its_flag(monkeypatch):
 
     matte = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
     scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": matte}})
-    rows = [np.vstack([row, np.zeros_like(row[:1])]) for row in material_rows(scene.shapes())]
-    monkeypatch.setattr(facts, "LOBES", (*LOBES, Sheen()))
-    monkeypatch.setattr(facts, "material_rows", lambda shapes: rows)
+    rows = [np.vstack([row[:3], np.zeros_like(row[:1])]) for row in material_rows(scene.shapes())[0]]
+    monkeypatch.setattr(facts, "LOBES", (*LOBES[:2], Sheen()))
+    monkeypatch.setattr(facts, "material_rows", lambda shapes: (rows, ""))
     found = facts.Reading(Snapshot(scene, None), Kept()).facts.lobes
     assert found == (("diffuse", True), ("specular", False), ("sheen", True))
 
