@@ -1,4 +1,4 @@
-"""The kinds of quadrics that ``mrt_whitted`` traces exactly, a class of pure functions each, and their table.
+"""The kinds of quadrics that ``mrt_whitted`` traces exactly, as pure functions, and their table.
 
 Everything works in float32 and float64, on scalars, Dr.Jit arrays and lists of columns alike (see
 ``intersect``). The numbers of a quadric are those of its points, as many as ``points``, and a radius.
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import Any
 
@@ -88,22 +89,21 @@ class Sphere:
         return np.hstack([points, points, np.zeros((6, 2))]), np.array(faces)
 
 
+@dataclass(frozen=True)
 class Axial:
-    """A solid of revolution along z from 0 to 1: a side, and a disc of radius 1 at each end that is one.
+    """A solid of revolution along z from 0 to 1, with a radius of 1 at z = 1: a side, and discs at its ends.
 
-    ``slope``: how much the radius of the side grows from z = 0 to z = 1. Without ``capped`` it is open.
     Texture coordinates: u = azimuth / 2π in [0, 1), v = 1 - z on the side, the unit square around a disc.
     """
 
-    points = 2
-    slope = 0
-    parts: tuple[int, ...] = (LATERAL, BASE)
-    ends = (DISC, DISC)
-    first_hit: Callable
-    side: Callable[[int], UnitMesh]
+    first_hit: Callable  # of a ray in world space, as ``intersect_cone`` gives it
+    side: Callable[[int], UnitMesh]  # the mesh of the side, from the number of segments
+    slope: int  # how much the radius of the side grows from z = 0 to z = 1
+    parts: tuple[int, ...]
+    ends: tuple[tuple[int, ...], tuple[int, ...]]
+    closed: bool = True  # with discs
 
-    def __init__(self, *, capped: bool = True) -> None:
-        self.closed = capped
+    points = 2
 
     def intersect(self, o, d, frame: Frame):
         """Return t > 0 of the first hit in units of |d|, inf for a miss, and the part that is hit."""
@@ -167,48 +167,34 @@ class Axial:
         return type(q)(by_u), type(q)(by_v)
 
 
-class Cone(Axial):
-    """The apex at 0, the base disc at z = 1."""
-
-    slope = 1
-    ends = (POINT, DISC)
-    first_hit = staticmethod(intersect_cone)
-
-    def side(self, segments: int) -> UnitMesh:
-        """Return a fan from the apex, with a vertex and a normal there for each triangle."""
-        azimuth = 2 * np.pi * np.arange(segments + 1) / segments
-        between = 0.5 * (azimuth[1:] + azimuth[:-1])
-        apex = _ring(between, 0.0, slope=-1.0, v=1.0, radius=0.0)
-        rim = _ring(azimuth, 1.0, slope=-1.0, v=0.0)
-        i = np.arange(segments)
-        faces = np.stack([i, i + segments + 1, i + 1], axis=1)
-        return np.concatenate([rim, apex]), faces
+def fan(segments: int) -> UnitMesh:
+    """Return the side of a cone: a vertex and a normal at the apex for each triangle."""
+    azimuth = 2 * np.pi * np.arange(segments + 1) / segments
+    between = 0.5 * (azimuth[1:] + azimuth[:-1])
+    i = np.arange(segments)
+    faces = np.stack([i, i + segments + 1, i + 1], axis=1)
+    return np.concatenate([_ring(azimuth, 1, slope=1), _ring(between, 0, slope=1)]), faces
 
 
-class Cylinder(Axial):
-    """Radius 1 from z = 0 to z = 1."""
+def strip(segments: int) -> UnitMesh:
+    """Return the side of a cylinder: quads, each split in two."""
+    azimuth = 2 * np.pi * np.arange(segments + 1) / segments
+    i = np.arange(segments)
+    k = i + segments + 1
+    lower = np.stack([i, i + 1, k], axis=1)
+    upper = np.stack([i + 1, k + 1, k], axis=1)
+    return np.concatenate([_ring(azimuth, 0), _ring(azimuth, 1)]), np.concatenate([lower, upper])
 
-    parts = (LATERAL, BASE, TOP)
-    first_hit = staticmethod(intersect_cylinder)
 
-    def side(self, segments: int) -> UnitMesh:
-        """Return a strip of quads, each split in two."""
-        azimuth = 2 * np.pi * np.arange(segments + 1) / segments
-        i = np.arange(segments)
-        k = i + segments + 1
-        rings = [_ring(azimuth, z, slope=0.0, v=1.0 - z) for z in (0.0, 1.0)]
-        lower = np.stack([i, i + 1, k], axis=1)
-        upper = np.stack([i + 1, k + 1, k], axis=1)
-        faces = np.concatenate([lower, upper])
-        return np.concatenate(rings), faces
-
+_CONE = Axial(intersect_cone, fan, slope=1, parts=(LATERAL, BASE), ends=(POINT, DISC))
+_CYLINDER = Axial(intersect_cylinder, strip, slope=0, parts=(LATERAL, BASE, TOP), ends=(DISC, DISC))
 
 KINDS: dict[str, Any] = {
     "sphere": Sphere(),
-    "cone": Cone(),
-    "open cone": Cone(capped=False),
-    "cylinder": Cylinder(),
-    "open cylinder": Cylinder(capped=False),
+    "cone": _CONE,
+    "open cone": replace(_CONE, closed=False),
+    "cylinder": _CYLINDER,
+    "open cylinder": replace(_CYLINDER, closed=False),
 }
 
 
@@ -225,25 +211,26 @@ def _turn(q):
     return dr.select(azimuth < 0, azimuth + 1, azimuth)
 
 
-def _ring(azimuth: np.ndarray, z: float, *, slope: float, v: float, radius: float = 1.0) -> np.ndarray:
-    """Return vertices around the axis."""
+def _ring(azimuth: np.ndarray, z: int, *, slope: int = 0) -> np.ndarray:
+    """Return vertices around the axis, on a side whose radius is 1 at z = 1 and grows by ``slope``."""
     x = np.cos(azimuth)
     y = np.sin(azimuth)
     one = np.ones_like(azimuth)
-    around = azimuth / (2 * np.pi)
-    return np.stack([radius * x, radius * y, z * one, x, y, slope * one, around, v * one], axis=1)
+    radius = 1 - slope * (1 - z)
+    u = azimuth / (2 * np.pi)
+    return np.stack([radius * x, radius * y, z * one, x, y, -slope * one, u, (1 - z) * one], axis=1)
 
 
-def _disc(segments: int, z: float) -> UnitMesh:
+def _disc(segments: int, z: int) -> UnitMesh:
     """Return a fan around the centre, facing away from z = 1/2."""
     i = np.arange(segments)
-    rim = _ring(2 * np.pi * i / segments, z, slope=0, v=0)
+    rim = _ring(2 * np.pi * i / segments, z)
     center = [0, 0, z, 0, 0, 0, 0, 0]
     vertices = np.concatenate([rim, [center]])
-    vertices[:, 3:6] = 0, 0, 1 if z > 0.5 else -1
+    vertices[:, 3:6] = 0, 0, 1 if z == 1 else -1
     vertices[:, 6:] = 0.5 + 0.5 * vertices[:, :2]
     faces = np.stack([i, (i + 1) % segments, np.full_like(i, segments)], axis=1)
-    return vertices, faces if z > 0.5 else faces[:, ::-1]
+    return vertices, faces if z == 1 else faces[:, ::-1]
 
 
 def _join(*parts: UnitMesh) -> UnitMesh:
