@@ -51,8 +51,11 @@ _CORNERS = {
 
 
 def _run(name: str, word: bytes) -> bytes:
-    """The pattern of lines: of "f_3_tn", up to some thousand with the keyword f and three words; of "f_0_tn",
-    one with any number of words. Regular expressions keep a state for each repetition."""
+    """The pattern of a run of lines with the same keyword and number of words.
+
+    "f_3_tn": up to 4096 lines of f and three words. "f_0_tn": a single line of f and seven words or more, as
+    regular expressions keep a state for each repetition.
+    """
     keyword, count, *_ = name.split("_")
     words = (_GAP + word) * int(count)
     most = 4096
@@ -103,8 +106,8 @@ class _Reader:
         self.line = 1
         self.values = {kind: [np.empty((0, used), np.float32)] for kind, used in _USED.items()}
         self.counts = dict.fromkeys(_USED, 0)
-        # Of faces of as many corners, one on each line: indices from 0, int64 [F, corners, kinds]; the kinds,
-        # as in ``_CORNERS``; the material; the first line
+        # Runs of faces with the same number of corners, one on each line: indices from 0, int64 [F, corners,
+        # kinds]; the kinds, as in ``_CORNERS``; the material; the first line
         self.faces: list[tuple[np.ndarray, list[int], str, int]] = []
         self.material = ""
         self.materials: dict[str, Material] = {}

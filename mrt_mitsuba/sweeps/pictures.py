@@ -65,8 +65,10 @@ def is_fresh(job: Job, folder: str, noted: Facts | None, png: bool = False) -> b
     it is what damage left of the noted one.
     """
     sums = str((noted or {}).get("checksum") or "").split()
+    checksums = dict(zip(job.files(png=True), sums, strict=False))  # of the EXR and the PNG, if any
     fresh = True
-    for file, known in itertools.zip_longest(job.files(png), sums[: len(job.files(png))], fillvalue=""):
+    for file in job.files(png):
+        known = checksums.get(file, "")
         path = os.path.join(folder, file)
         marked = mark(path)
         # A file without a mark is what damage left of the noted one if it is no picture at all, or as long
