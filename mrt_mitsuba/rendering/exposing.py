@@ -164,27 +164,25 @@ class FilmStarts:
         return Start(*self.film.place(inside, self.sampler), None, self.sampler)
 
 
+@dataclass(frozen=True)
 class SceneStarts:
     """Rays start in the pixels of a film where the sampler of its scene places ``rays`` of each pixel."""
 
-    def __init__(self, film: Film, seed: Any, rays: int) -> None:
-        self._film = film
-        self._seed = seed
-        self._rays = rays
-        one_by_one = mi.variant().startswith("scalar")
-        independent = one_by_one or film.sampler == "IndependentSampler"
-        self._independent = ray_sampler(rays) if independent else None
+    film: Film
+    seed: Any  #: a number, or an array of one
+    rays: int
+    independent: mi.Sampler | None  #: in place of Mitsuba's of this name; None: the scene has another
 
     def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
-        if self._independent is not None:
-            sampler = self._independent
-            sampler.start_in(self._seed, pixel, number)
+        if self.independent is not None:
+            sampler = self.independent
+            sampler.start_in(self.seed, pixel, number)
         else:
-            sampler = self._film.sensor.sampler().clone()
-            sampler.set_sample_count(self._rays)
-            sampler.set_samples_per_wavefront(self._rays)
-            sampler.seed((self._seed + before) % 2**32, dr.width(pixel))
-        return Start(*self._film.place(pixel, sampler), None, sampler)
+            sampler = self.film.sensor.sampler().clone()
+            sampler.set_sample_count(self.rays)
+            sampler.set_samples_per_wavefront(self.rays)
+            sampler.seed((self.seed + before) % 2**32, dr.width(pixel))
+        return Start(*self.film.place(pixel, sampler), None, sampler)
 
 
 Starts = LatticeStarts | FilmStarts | SceneStarts
@@ -285,8 +283,11 @@ class Exposer:
     def starts(self, places: Places, seed: Any) -> LatticeStarts | SceneStarts:
         """Where the rays of a pass start; ``seed``: a number, or an array of one."""
         shader = self.shader
-        if self.film is not None:
-            return SceneStarts(self.film, seed, self.film.rays_near(places.size))
+        film = self.film
+        if film is not None:
+            rays = film.rays_near(places.size)
+            independent = mi.variant().startswith("scalar") or film.sampler == "IndependentSampler"
+            return SceneStarts(film, seed, rays, ray_sampler(rays) if independent else None)
         random = shader.random or mi.is_spectral or shader.sensor.needs_aperture_sample()
         sampler = ray_sampler(places.size) if random else None
         return LatticeStarts(places, shader.width, shader.height, seed, sampler)

@@ -40,7 +40,7 @@ class Passes:
         self._job = job
         self._shader = shader
         self._plan = plan
-        self._phase = frame / plan.moments if plan.frames > 1 else None  # None: as the places say
+        self._frame = frame
         self._seed = plan.seed + 2 * frame  # two passes in a frame, each with random numbers of its own
         self._seen = plan.seen.inside(Region(0, 0, plan.width, plan.height))
         self.layers: dict[str, np.ndarray] = {}
@@ -75,10 +75,11 @@ class Passes:
 
     def _trace(self, step: Pass, exposer: Exposer) -> None:
         """Trace samples of a lattice: their means are new layers or, at edges, are averaged with these."""
-        phase = step.places.phase if self._phase is None else self._phase
+        plan = self._plan
+        phase = self._frame / plan.moments if plan.frames > 1 else step.places.phase
         places = replace(step.places, seed=self._seed, phase=phase)
-        seen = self._plan.seen
-        width = self._plan.width
+        seen = plan.seen
+        width = plan.width
         count = seen.width * seen.height
         pixels: Any = range(seen.y * width, (seen.y + seen.height) * width)
         edge = None

@@ -312,8 +312,7 @@ def _in_force(choices: _Choices, source: Source, shader: Shader, returned: froze
     """The options that shape the picture, with the values that were decided."""
     settings = choices.settings
     goal = choices.goal
-    values = {name: getattr(settings, name) for name in _NAMED}
-    values |= {name: value for name, value in vars(choices).items() if name in _NAMED}
+    values = vars(settings) | vars(choices)
     values |= {
         "width": source.width,
         "height": source.height,
@@ -326,7 +325,7 @@ def _in_force(choices: _Choices, source: Source, shader: Shader, returned: froze
         values |= {"target": goal.target.plain, "maxspp": goal.most}
     if goal:
         values["maxseconds"] = goal.seconds
-    return {name: value for name, value in values.items() if value is not None}
+    return {name: values[name] for name in _NAMED if values[name] is not None}
 
 
 # --------------------------------------- Its decisions ----------------------------------------
