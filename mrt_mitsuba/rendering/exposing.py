@@ -210,7 +210,7 @@ class Stack:
         sums = np.zeros((channels, pictures, *film.shape), np.float32)
         return cls(film, sums, np.zeros_like(sums[0]), np.zeros_like(sums[0]))
 
-    @np.errstate(over="ignore")  # of light beyond float32, whose mean is infinite
+    @np.errstate(over="ignore", invalid="ignore")  # of light beyond float32, whose mean is infinite
     def plus(self, exposed: Canvas, chosen: np.ndarray, first: int = 0) -> Stack:
         """With as many pictures of an exposure as there are ``chosen`` pixels for, [pictures, pixels], from
         the ``first`` on."""

@@ -10,6 +10,7 @@ import pytest
 from nodes import sensor
 from numpy.testing import assert_allclose
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba.rays.film import Film
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -42,3 +43,17 @@ def test_noise_under_a_filter_has_its_variance_and_correlation(rfilter):
     assert np.mean(power**2) / 2 == pytest.approx(film.correlation, rel=0.08)
     alike = np.ones((1, *film.shape))
     assert_allclose(film.spread_out(alike), alike, rtol=1e-6)
+
+
+@pytest.mark.parametrize("region", [None, (3, 3, 4, 4)])
+def test_light_beyond_float32_is_infinite_where_it_is_seen(region):
+    """In pixels around the picture, too, whose rays weigh nothing there: infinity times 0 is no number."""
+    look = sensor([0, 0, 1], [0, 0, 0], (12, 9), rfilter="gaussian")
+    look["film"]["sample_border"] = True
+    light = {"type": "constant", "radiance": {"type": "rgb", "value": 3e38}}
+    result = mrt.render(
+        {"type": "scene", "sensor": look, "light": light}, integrator="path", spp=4, region=region
+    )
+    assert np.isposinf(result.image).all()
+    across, down = (region or (0, 0, 12, 9))[2:]
+    assert result.rays["primary"] == 4 * (across + 4) * (down + 4)  # those that the filter reaches from
