@@ -45,7 +45,7 @@ class Draws:
         pixels = self.film.pixels
         rays = groups.rays_of(pictures * pixels).reshape(pictures, pixels)
         before = np.zeros((pictures, pixels), np.int64)
-        before.ravel()[groups.pixels] = groups.first
+        before.ravel()[groups.pixels] = groups.shares[1]
         total, square, peak = np.zeros((3, pictures, pixels))
         for picture, draw in enumerate(self.draws):
             rng = np.random.default_rng((seed, picture, int(before[picture].sum())))
