@@ -207,7 +207,7 @@ OF_THE_REST = {
     "active ignored": Mistake("active", None, {"eval_pdf.inactive"}),
 }
 MISTAKES = OF_VALUES | OF_SAMPLES | OF_THE_REST
-CHANGES = {name: (mistake.nested, mistake.kind, mistake.change) for name, mistake in MISTAKES.items()}
+CHANGES = {name: (mistake.kind, mistake.change) for name, mistake in MISTAKES.items()}
 
 
 def exceeded(check):

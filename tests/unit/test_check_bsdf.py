@@ -178,7 +178,7 @@ def test_a_plugin_of_one_variant_only_that_never_ends_and_changes_flags():
             time.sleep(0.001)
         return value
 
-    mi.register_bsdf("once", power.changed_bsdf({"": ({}, "eval", answer)}))
+    mi.register_bsdf("once", power.changed_bsdf({"": ("eval", answer)}))
     once = {"type": "once", "change": "", "nested": {"type": "diffuse"}}
     law = mrt.check_bsdf(once, quick=True, only=["variants"]).laws["variants"]
     assert "does not know the plugin" in law.skipped

@@ -42,7 +42,7 @@ def poisoned():
     def poison(value, ctx, wi, wo):
         return dr.select((wi.z > 0.995) & (value != 0), dr.nan, value)
 
-    changes = {"poison": ({"type": "diffuse"}, "eval", poison)}
+    changes = {"poison": ("eval", poison)}
     mi.register_bsdf("poisoned", changed_bsdf(changes))
 
 

@@ -15,24 +15,24 @@ from mrt_mitsuba.validation.checks import bsdf, emitter, shape
 from mrt_mitsuba.validation.checks.bsdf import check_bsdf
 from mrt_mitsuba.validation.checks.emitter import check_emitter
 from mrt_mitsuba.validation.checks.examine import Check
-from mrt_mitsuba.validation.checks.law import Description, Fault, Judge, faults_of
+from mrt_mitsuba.validation.checks.law import Fault, Judge, faults_of
 from mrt_mitsuba.validation.checks.shape import check_shape
 from mrt_mitsuba.validation.checks.subject import Given
 
-Changes = tuple[Description, str, Any]  # the BSDF that is changed, the kind of change, and the change
+Change = tuple[str, Any]  # the kind of change, and the change
 
 
 def unchanged(value, *_):
     return value
 
 
-AS_IS: Changes = ({}, "", unchanged)
+AS_IS: Change = ("", unchanged)
 
 
 def changed_bsdf(changes):
     """A class of BSDFs whose answers are those of another, changed: for ``register_bsdf``.
 
-    ``changes``: by name, the dict of the BSDF, what is changed, and a function: of (value, ctx, wi, wo) for
+    ``changes``: by name, what is changed, and a function: of (value, ctx, wi, wo) for
     "eval", "pdf", what eval_pdf() alone gives ("pair"), or values and weights ("value"); of (bs, weight, u,
     ctx) for "sample"; of the random numbers u for "u"; of ctx for "context". "flags" are added, to components
     as well or to the "whole" alone; "active" is overlooked; an "update" adds a component.
@@ -42,7 +42,7 @@ def changed_bsdf(changes):
         def __init__(self, props):
             mi.BSDF.__init__(self, props)
             self.nested = props["nested"]
-            _, self.kind, self.change = changes.get(props["change"], AS_IS)[:3]
+            self.kind, self.change = changes.get(props["change"], AS_IS)
             more = self.change if self.kind == "flags" else 0
             count = self.nested.component_count()
             self.m_components = [int(self.nested.flags(i)) | more for i in range(count)]
@@ -152,20 +152,15 @@ def changed_sky(changes):
     return Sky
 
 
-def _faulty_bsdf(fault, changes):
-    """The dict of a BSDF with the fault; several may be in use, each under a name. Needs ``register``."""
-    nested = fault.nested or {"type": "diffuse"}
-    ((kind, change),) = changes.items()
-    name = f"{fault.what} {change.args[0]}"
-    FAULTY[name] = (nested, kind, change)
-    return {"type": "faulty", "change": name, "nested": nested}
+def faulty_bsdf(nested, **changes):
+    """The dict of a BSDF with a change; several may be in use, each under a number. Needs ``register``."""
+    number = str(len(FAULTY))
+    (FAULTY[number],) = changes.items()
+    return {"type": "faulty", "change": number, "nested": nested or {"type": "diffuse"}}
 
 
-def _faulty_shape(fault, changes):
-    return ChangedShape(fault.nested, **changes)
-
-
-def _faulty_sky(fault, changes):
+def faulty_sky(nested, **changes):
+    """The dict of a constant sky with changes, which the next one replaces."""
     mi.register_emitter("faulty_sky", changed_sky(changes))
     return {"type": "faulty_sky"}
 
@@ -185,7 +180,7 @@ class Kind:
     def check_fault(self, fault: Fault, size: float, *, quick: bool) -> Check:
         """Check a plugin with a fault of that size by the law that should find it."""
         changes = {name: partial(change, size) for name, change in fault.changes.items()}
-        return self.check(self.faulty(fault, changes), only=[fault.law], quick=quick)
+        return self.check(self.faulty(fault.nested, **changes), only=[fault.law], quick=quick)
 
     def least_found(self, fault: Fault, *, quick: bool) -> float:
         """The least size that fails, tried from three times that in the table down; infinity for none."""
@@ -199,11 +194,11 @@ class Kind:
 
 
 FACTORS = (3, 2, 1, 0.5, 0.3, 0.1)
-FAULTY: dict[str, Changes] = {}  # by name, the changes of the BSDF "faulty"
+FAULTY: dict[str, Change] = {}  # by number, the change of the BSDF "faulty"
 KINDS = {
-    "BSDF": Kind(check_bsdf, bsdf.LAWS, _faulty_bsdf),
-    "shape": Kind(check_shape, shape.LAWS, _faulty_shape),
-    "emitter": Kind(check_emitter, emitter.LAWS, _faulty_sky),
+    "BSDF": Kind(check_bsdf, bsdf.LAWS, faulty_bsdf),
+    "shape": Kind(check_shape, shape.LAWS, ChangedShape),
+    "emitter": Kind(check_emitter, emitter.LAWS, faulty_sky),
 }
 
 
