@@ -55,13 +55,13 @@ def theirs(alpha: float, *, visible: bool = True) -> Values:
     return {"type": "roughconductor", **lobe, "alpha": alpha, "sample_visible": visible}
 
 
-def compare_pointwise(alpha: float, *, count: int, seed: int = 1) -> dict[str, float]:
+def compare_pointwise(alpha: float, *, count: int) -> dict[str, float]:
     """The largest relative differences over ``count`` random pairs of directions, by ``NAMES``.
 
     Of plain D sampling's density only where |ωi + ωo|² > ``SHORT``: Mitsuba's divides by ωo·h and so feels
     the rounding of the length of ωo, by 6e-8 / |ωi + ωo|².
     """
-    wi, wo = lobe_pairs(count, alpha, seed=seed)
+    wi, wo = lobe_pairs(count, alpha)
     values = []
     densities = []
     for visible in (True, False):

@@ -38,12 +38,12 @@ def pairs_about(cosine: Array, slope: Array, rng: np.random.Generator) -> tuple[
     return wi, np.float32(2 * (wi * m).sum(axis=-1, keepdims=True) * m - wi)
 
 
-def lobe_pairs(count: int, alpha: float, *, seed: int = 1) -> tuple[Array, Array]:
+def lobe_pairs(count: int, alpha: float) -> tuple[Array, Array]:
     """Pairs of random directions above the surface whose half vector lies within a slope of 4 alpha.
 
     Both cosines are at least 0.02. Beyond that slope the lobe is below e^-16 of its peak.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     pairs = np.empty((2, 0, 3))
     while pairs.shape[1] < count:
         slope = alpha * 4 * np.sqrt(rng.random(4 * count))

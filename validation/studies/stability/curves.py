@@ -27,7 +27,7 @@ from mrt_mitsuba.validation.studies.stability.geometry import (
 )
 from mrt_mitsuba.validation.tools import diagrams
 from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, pairs_about
-from mrt_mitsuba.validation.tools.study import Study, Values
+from mrt_mitsuba.validation.tools.study import Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -111,10 +111,7 @@ def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
     axes.set_xlabel(axis.label, **diagrams.WORDS)
     axes.set_ylabel("error in roundings", **diagrams.WORDS)
     axes.grid(alpha=0.2)
-    place: Values = {"transform": axes.get_yaxis_transform(), "va": "bottom", "ha": "center"}
-    axes.text(
-        0.5, 1.3 * NONE_RIGHT, "no digit is right", color=diagrams.GREY, fontsize=diagrams.LABELS, **place
-    )
+    diagrams.note(axes, 0.5, 0.9, "no digit is right", va="bottom", ha="center")
     ends = {
         FIRST: (x[-1], lines[FIRST][-1], diagrams.GREY),
         axis.nearest: (x[-1], lines[THEIRS][-1], orange),
@@ -270,29 +267,23 @@ def axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curv
     height = 2 * float(norm(tip))
     wide, slope = (0.0, radius / height) if kind is Cone else (radius, 0.0)
     outwards = unit(np.cross(along, rng.normal(size=(count, 3))))
-    depth = height * rng.uniform(0.2, 0.8, (count, 1))
-    targets = tip - depth * along + (wide + slope * depth) * outwards
+    depths = height * rng.uniform(0.2, 0.8, (count, 1))
+    targets = tip - depths * along + (wide + slope * depths) * outwards
     normal = unit(outwards + slope * along)
     rays = _aimed(targets, targets + 3 * unit(normal + 0.3 * rng.normal(size=(count, 3))))
 
     stock = {"type": "cylinder", "p0": base, "p1": tip, "radius": radius} if kind is Cylinder else None
-    first = _first_side(rays, np.float32(tip), np.float32(-along), np.float32(slope), np.float32(wide))
     thing = kind(tuple(tip.tolist()), tuple(base.tolist()), radius, MIRROR)
-    return _hits(thing, rays, first, stock)
-
-
-def _down_and_across(v: Array, down: Array) -> tuple[Array, Array]:
-    """The parts of vectors [N, 3] along a unit vector [N], and across it [N, 3]."""
-    depth = v @ down
-    return depth, v - depth[:, None] * down
-
-
-def _first_side(rays: Rays, tip: Array, down: Array, slope: np.float32, r: np.float32) -> Array:
-    """Distances t of |q|² = (r + slope · depth)², q across the axis, as one would write it first."""
+    # as one would write it first: |q|² = (wide + slope · depth)², q across the axis
     o, d = rays
-    depth, q = _down_and_across(o - tip, down)
-    faster, across = _down_and_across(d, down)
-    k = slope**2
+    down = np.float32(-along)
+    from_tip = o - np.float32(tip)
+    depth = from_tip @ down
+    faster = d @ down
+    q = from_tip - depth[:, None] * down
+    across = d - faster[:, None] * down
+    k = np.float32(slope) ** 2
+    r = np.float32(wide)
     a = dot(across, across) - k * faster**2
     b = 2 * (dot(q, across) - k * depth * faster)
     c = dot(q, q) - k * depth**2 - r * r
@@ -300,7 +291,7 @@ def _first_side(rays: Rays, tip: Array, down: Array, slope: np.float32, r: np.fl
     def below_tip(t: Array) -> Array:
         return depth + t * faster >= 0
 
-    return _quadratic(a, b, c, below_tip)  # one half of a double cone
+    return _hits(thing, rays, _quadratic(a, b, c, below_tip), stock)  # one half of a double cone
 
 
 LOBE = 2e-5 / ROUNDING

@@ -16,8 +16,7 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation.oracles.reference import reference_render
 from mrt_mitsuba.validation.studies.stability.case import Case
-
-Options = dict[str, Any]
+from mrt_mitsuba.validation.tools.study import Values
 
 WIDTH = 64
 HEIGHT = 48
@@ -77,7 +76,7 @@ def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
     return Scene(Camera((0.0, 0.1, 1.0), (0.05, 0.0, -2.0)), (0.2, 0.3, 0.4), (lamp,), (ball,), walls)
 
 
-FULL: Options = {"fresnel": "unity"}
+FULL: Values = {"fresnel": "unity"}
 OPEN = {"clamp": False}
 
 
@@ -88,21 +87,24 @@ class Path:
     name: str
     what: str
     scene: Scene
-    fault: Scene | Options
+    fault: Scene | Values
     limit: float = PLAIN
-    settings: Options = field(default_factory=dict)  #: of both tracers
+    settings: Values = field(default_factory=dict)  #: of both tracers
     exact: Scene | None = None  #: the scene whose exact picture it is, if not this one
+
+    @property
+    def chosen(self) -> Values:
+        """The settings of both tracers, with what they are by default."""
+        return {"fresnel": "dielectric", "clamp": True, **self.settings}
 
     def truth(self, scene: Scene, **settings: Any) -> np.ndarray:
         """The picture [H, W, 3] of a scene by the float64 tracer, with other settings than its own."""
-        chosen = {"fresnel": "dielectric", "clamp": True, **self.settings, **settings}
-        return reference_render(scene, width=WIDTH, height=HEIGHT, **chosen).image
+        return reference_render(scene, width=WIDTH, height=HEIGHT, **self.chosen | settings).image
 
     def rendered(self) -> np.ndarray:
         """Our picture [H, W, 3]."""
-        fresnel = self.settings.get("fresnel", "dielectric")
-        nodes = self.scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=fresnel)
-        clamp = self.settings.get("clamp", True)
+        nodes = self.scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=self.chosen["fresnel"])
+        clamp = self.chosen["clamp"]
         nodes["integrator"] = {"type": "mrt_whitted", "clamp": clamp, "min_contribution": 0.0}
         return render(nodes, aa=1, lattice="report").image
 
