@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from scipy.stats import gmean
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.tools.compare import Array, averaged, compare
 from mrt_mitsuba.validation.tools.scenery import KINDS, LOCAL, SCENES, load, load_kind
-from mrt_mitsuba.validation.tools.study import Study, kernel_records, timed_in_turns
+from mrt_mitsuba.validation.tools.study import Study, Values, kernel_records, timed_in_turns
 
 TITLE = "The cost of an error, against the best sampler"
 SAMPLERS = ("independent", "stratified", "multijitter", "ldsampler")
@@ -28,8 +28,6 @@ QUICK = ("gloss", "stratified", "texture_and_sky")
 UNIFORM = 128  # rays a pixel of ``SCENES``
 TIMED = ("calm", "texture", "gloss", "glass", "spot")  # kinds whose rays are timed
 WIDE = 1.15  # of a target: what misses it by more must warn
-
-Row = dict[str, Any]
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -50,7 +48,7 @@ def uniform(scene: Any, spp: int, seed: int) -> Array:
     return np.array(mi.render(scene, spp=spp, seed=seed))
 
 
-def adaptive(scene: Any, options: Row, seed: int) -> mrt.Result:
+def adaptive(scene: Any, options: Values, seed: int) -> mrt.Result:
     """The result of ``mrt.render``."""
     return mrt.render(scene, seed=seed, **options)
 
@@ -59,7 +57,7 @@ def mean_rays(results: Sequence[mrt.Result]) -> float:
     return float(np.median([result.rounds[-1].spp for result in results]))
 
 
-def goals(study: Study, what: str, rows: Sequence[Row], mean: float, worst: float) -> None:
+def goals(study: Study, what: str, rows: Sequence[Values], mean: float, worst: float) -> None:
     """Hold the "time" of rows, and where it is "from" and "to", to goals."""
     low, middle, high = gmean([[row[name] for name in ("from", "time", "to")] for row in rows]).tolist()
     why = "rays that are saved, each a fifth dearer"
@@ -74,8 +72,8 @@ def goals(study: Study, what: str, rows: Sequence[Row], mean: float, worst: floa
 
 def renders_to_an_error(study: Study, size: int, rays: int, *, turns: int, seeds: int) -> None:
     """Render to the error that ``multijitter`` has after so many rays a pixel."""
-    costs: list[Row] = []
-    aims: list[Row] = []
+    costs: list[Values] = []
+    aims: list[Values] = []
     level = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)  # samplers that round numbers of rays say so each time
     try:
@@ -97,7 +95,7 @@ def renders_to_an_error(study: Study, size: int, rays: int, *, turns: int, seeds
     study.at_most(what, unsaid, max(1, seeds // 10), "an interval of 95 %")
 
 
-def to_an_error(kind: str, size: int, rays: int, turns: int, seeds: int) -> tuple[Row, Row]:
+def to_an_error(kind: str, size: int, rays: int, turns: int, seeds: int) -> tuple[Values, Values]:
     """What a render to an error takes, and how near to its target it ends."""
     scene = load_kind(kind, size)
     truth, spread = averaged([uniform(scene, 4 * rays, 1000 + k) for k in range(8)])
@@ -110,13 +108,11 @@ def to_an_error(kind: str, size: int, rays: int, turns: int, seeds: int) -> tupl
     target = error([uniform(scene, rays, 2000 + k) for k in range(4)])
     ladder = [round(step * rays) for step in LADDER]
     ours = partial(adaptive, scene, {"target": target})
-    sides: list[Callable[[int], Any]] = [ours]
-    for sampler in SAMPLERS:
-        other = load_kind(kind, size, sampler)
-        sides += [partial(uniform, other, count) for count in ladder]
+    loaded = [load_kind(kind, size, sampler) for sampler in SAMPLERS]
+    others = [partial(uniform, other, count) for other in loaded for count in ladder]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mrt.MrtWarning)
-        (results, seconds), *theirs = timed_in_turns(sides, turns)
+        (results, seconds), *theirs = timed_in_turns([ours, *others], turns)
     ratios: list[float] = []
     warned: list[bool] = []
     for seed in range(seeds):
@@ -125,10 +121,10 @@ def to_an_error(kind: str, size: int, rays: int, turns: int, seeds: int) -> tupl
             ratios.append(error([ours(seed).image]) / target)
         if ratios[-1] > WIDE:
             warned.append(bool(messages))
-    aim: Row = {"scene": kind, "median": float(np.median(ratios)), "RMS": math.hypot(*ratios) / seeds**0.5}
+    aim: Values = {"scene": kind, "median": float(np.median(ratios)), "RMS": math.hypot(*ratios) / seeds**0.5}
     aim |= {"worst": max(ratios), f"above {WIDE}": len(warned), "warned": sum(warned)}
     reached = target * aim["RMS"]
-    costs: list[Row] = []
+    costs: list[Values] = []
     for k, sampler in enumerate(SAMPLERS):
         rungs = theirs[k * len(ladder) : (k + 1) * len(ladder)]
         errors = [error(pictures) for pictures, _ in rungs]
@@ -137,7 +133,7 @@ def to_an_error(kind: str, size: int, rays: int, turns: int, seeds: int) -> tupl
         slower = seconds / rungs[1][1] * medians[1] / there
         low, middle, high = np.quantile(slower, (0.1, 0.5, 0.9))
         needed = mean_rays(results) / _at(reached, errors, ladder)
-        cost: Row = {"scene": kind, "sampler": sampler, "its seconds": there, "rays": needed}
+        cost: Values = {"scene": kind, "sampler": sampler, "its seconds": there, "rays": needed}
         costs.append(cost | {"a ray": middle / needed, "time": middle, "from": low, "to": high})
     return min(costs, key=lambda cost: float(cost["its seconds"])), aim
 
@@ -165,14 +161,14 @@ def path_time(records: Sequence[Mapping[str, Any]]) -> float:
 
 def rays_alone(study: Study, size: int, rays: int, *, turns: int) -> None:
     """Trace as many rays as ``multijitter``."""
-    rows: list[Row] = []
+    rows: list[Values] = []
     for kind in study.each(f"Rays, {size}x{size}", TIMED):
-        row: Row = {"scene": kind}
+        row: Values = {"scene": kind}
         for rfilter in ("box", "gaussian"):
             scene = load_kind(kind, size, rfilter=rfilter)
             ours = partial(adaptive, scene, {"aamode": "noise", "spp": rays})
-            sides: list[Callable[[int], Any]] = [ours, partial(uniform, scene, rays)]
-            (results, seconds), (_, others) = timed_in_turns(sides, turns)
+            theirs = partial(uniform, scene, rays)
+            (results, seconds), (_, others) = timed_in_turns([ours, theirs], turns)
             spent = mean_rays(results) / rays
             ray = float(np.median(seconds / others)) / spent
             path = path_time(kernel_records(partial(mrt.render, scene, aamode="noise", spp=rays)))
@@ -194,7 +190,7 @@ def rays_alone(study: Study, size: int, rays: int, *, turns: int) -> None:
 
 def own_scenes(study: Study, names: Sequence[str], size: tuple[int, int], *, turns: int) -> None:
     """Compare pictures with Mitsuba's, and costs with those of the samplers that the scenes name."""
-    rows: list[Row] = []
+    rows: list[Values] = []
     for name in study.each("Scenes of one's own", names):
         row = own_scene(name, size, turns)
         what = f"{name}: uniform samples off mi.render's, over their noise"
@@ -213,7 +209,7 @@ def own_scenes(study: Study, names: Sequence[str], size: tuple[int, int], *, tur
     study.goal(f"{what}, as it is: geometric mean", mean, 0.5, "rays that are saved", interval=(mean, mean))
 
 
-def own_scene(name: str, size: tuple[int, int], turns: int) -> Row:
+def own_scene(name: str, size: tuple[int, int], turns: int) -> Values:
     """How far uniform samples are off Mitsuba's, and what their error costs where rays follow noise.
 
     A squared error is the distance from the mean of all turns, which needs no truth.
@@ -223,12 +219,12 @@ def own_scene(name: str, size: tuple[int, int], turns: int) -> Row:
     error = compare(one, other).rmse / math.sqrt(2)
     same = adaptive(scene, {"aa": 1, "aamode": "none", "spp": UNIFORM}, 1000)
     ours = partial(adaptive, scene, {"target": error})
-    sides: list[Callable[[int], Any]] = [ours, partial(uniform, scene, UNIFORM)]
-    (results, seconds), (pictures, others) = timed_in_turns(sides, turns)
+    theirs = partial(uniform, scene, UNIFORM)
+    (results, seconds), (pictures, others) = timed_in_turns([ours, theirs], turns)
     images = [result.image for result in results]
     squares = [np.var(side, axis=0, ddof=1).mean() for side in (images, pictures)]
     worth = float(squares[0] / squares[1])
     low, middle, high = np.quantile(seconds / others, (0.1, 0.5, 0.9)).tolist()
-    row: Row = {"scene": name, "sampler": scene.sensors()[0].sampler().class_name()}
+    row: Values = {"scene": name, "sampler": scene.sensors()[0].sampler().class_name()}
     row |= {"off by": compare(same, one).rmse / error, "rays": worth * mean_rays(results) / UNIFORM}
     return row | {"as it is": middle, "time": worth * middle, "from": worth * low, "to": worth * high}

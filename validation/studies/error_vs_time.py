@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import Study, Values
 from mrt_mitsuba.validation.tools.work_precision import Findings, describe, error_vs_time
 
 TITLE = "Error against run time"
@@ -21,7 +21,6 @@ CUT_OFFS = (0.0, PROMISED, 1 / 255, 4 / 255, 16 / 255)
 DEPTHS = (1, 2, 3, 5, 10)
 BOX = "Cornell box"
 
-Options = dict[str, Any]
 Number = int | str  # of a scene of the report, or ``BOX``
 
 
@@ -90,10 +89,10 @@ class Trade:
 
     title: str  #: of the settings
     truth: str  #: what the reference is
-    scene: Options
-    cases: dict[str, Options]
+    scene: Values
+    cases: dict[str, Values]
     reference: Any
-    shared: Options = field(default_factory=dict)
+    shared: Values = field(default_factory=dict)
     limits: Callable[[Findings], Sequence[Limit]] | None = None
 
     def measure(self, cost: Cost) -> Findings:
@@ -140,7 +139,7 @@ def choices(number: Number, cost: Cost) -> dict[str, Findings]:
     }
 
 
-def advice(panels: Mapping[str, Findings]) -> list[Options]:
+def advice(panels: Mapping[str, Findings]) -> list[Values]:
     """Rows that name the settings to use to get to an error, for each title of ``choices``."""
     return [{"in": title, **row} for title, found in panels.items() for row in found.advice()]
 
@@ -162,7 +161,7 @@ def judged(found: Findings, case: str) -> Limit:
     return "error of the reference / least error it judges", share, 0.5, why
 
 
-def _scene(number: Number, size: tuple[int, int], **options: Any) -> Options:
+def _scene(number: Number, size: tuple[int, int], **options: Any) -> Values:
     """A scene of the report, or Mitsuba's Cornell box, as a dict."""
     width, height = size
     if isinstance(number, int):
@@ -172,7 +171,7 @@ def _scene(number: Number, size: tuple[int, int], **options: Any) -> Options:
     return box
 
 
-def _rounds(cost: Cost, **options: Any) -> dict[str, Options]:
+def _rounds(cost: Cost, **options: Any) -> dict[str, Values]:
     """Renders whose rays go where the noise is, of a number of rays or to an error."""
     own = {"aa": None, "lattice": None, **options}
     most = 4 * max(cost.rounds, default=1)
@@ -218,7 +217,7 @@ def sampling(number: int, cost: Cost) -> Trade:
 def whitted(number: int, cost: Cost) -> Trade:
     """Compare cut-offs, bounce limits and forms of the Fresnel factor, with the same samples."""
 
-    def integrator(**parameters: Any) -> Options:
+    def integrator(**parameters: Any) -> Values:
         return {"integrator": {"type": "mrt_whitted", **parameters}}
 
     cases = {f"min_contribution={255 * c:g}/255": integrator(min_contribution=c) for c in CUT_OFFS}

@@ -36,10 +36,10 @@ def _crowded(lights: int) -> Scene:
     rng = np.random.default_rng(5)
     start = rng.uniform(-2, 2, (330, 3))
     ends = start + 0.5 * rng.normal(size=(330, 3))
-    radii = rng.uniform(0.08, 0.2, 330).tolist()
-    points = (map(tuple, place.tolist()) for place in (start, ends))
-    materials = 66 * [SHINY, GREY, GREY, GREY, GREY]
-    things = list(zip(*points, radii, materials, strict=True))
+    radii = rng.uniform(0.08, 0.2, 330)
+    things = []
+    for number, (p, q, radius) in enumerate(zip(start.tolist(), ends.tolist(), radii.tolist(), strict=True)):
+        things.append((tuple(p), tuple(q), radius, GREY if number % 5 else SHINY))
     places = (6 * rng.normal(size=(lights, 3)) + [0, 6, 6]).tolist()
     color = (1.2 / lights, 1.2 / lights, 1.44 / lights)
     lamps = tuple(Light(tuple(place), color) for place in places)
@@ -47,7 +47,7 @@ def _crowded(lights: int) -> Scene:
         Camera((0, 1, 6), (0, 0, 0)),
         (0.2, 0.3, 0.4),
         lamps,
-        spheres=tuple(Sphere(p, *more) for p, _, *more in things[::3]),
+        spheres=tuple(Sphere(p, radius, material) for p, _, radius, material in things[::3]),
         cones=tuple(Cone(*thing) for thing in things[1::3]),
         cylinders=tuple(Cylinder(*thing) for thing in things[2::3]),
     )

@@ -26,12 +26,11 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.studies import roughconductor
 from mrt_mitsuba.validation.tools import renders
 from mrt_mitsuba.validation.tools.renders import load
-from mrt_mitsuba.validation.tools.study import Study, operations, ratio
+from mrt_mitsuba.validation.tools.study import Study, Values, operations, ratio
 
 TITLE = "Speed: against Mitsuba's own plugins, other ways and smaller tasks"
 
 Run = Callable[..., Any]
-Nodes = dict[str, Any]
 
 
 class Extent(NamedTuple):
@@ -46,7 +45,7 @@ class Extent(NamedTuple):
 
 
 # direct light alone, as Mitsuba's ``direct`` has it
-DIRECT: Nodes = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
+DIRECT: Values = {"type": "mrt_whitted", "max_depth": 1, "clamp": False, "min_contribution": 0.0}
 FULL = Extent(400, 300, 16, (0, 1, 2, 3, 4), 11, 1000)
 QUICK = Extent(48, 36, 16, (0,), 1, 16)
 
@@ -93,7 +92,7 @@ def compare(pair: Pair, repeats: int) -> tuple[dict[str, float], float]:
     return time, off
 
 
-def _render(nodes: Nodes, **options: Any) -> Run:
+def _render(nodes: Values, **options: Any) -> Run:
     return partial(mrt.render, load(nodes), **renders.ONE_RAY | options)
 
 
@@ -105,21 +104,21 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
     # random lights and paths leave half a percent at the size of the quick study
     same = 0.03, "the same light, else it would be no comparison; the rest is noise. One light less shows"
 
-    def nodes(number: int, flavor: str = "stock") -> Nodes:
+    def nodes(number: int, flavor: str = "stock") -> Values:
         return mrt.scene_dict(number, width=extent.width, height=extent.height, flavor=flavor)
 
     def other_light(ours: Run, other: Run, factor: float = 1) -> float:
         brightness = np.mean(ours(), dtype=np.float64)
         return abs(np.mean(other(), dtype=np.float64) / brightness / factor - 1)
 
-    def by(integrator: Nodes, number: int, flavor: str) -> Run:
+    def by(integrator: Values, number: int, flavor: str) -> Run:
         """Direct light in the scene of a flavour, with Mitsuba's lights in place of ours."""
         own = nodes(number, flavor)
         del own["sky"]  # direct would sample it, mrt_whitted does not
         lights = {name: node for name, node in nodes(number).items() if name.startswith("light_")}
         return renders.by_mitsuba(own | lights, extent.spp, integrator)
 
-    def of(bsdf: Callable[[float], Nodes], number: int) -> Run:
+    def of(bsdf: Callable[[float], Values], number: int) -> Run:
         """The scene of Mitsuba's plugins, with a material in place of ``roughplastic``."""
         stock = nodes(number)
         keep = "specular_reflectance"
@@ -142,7 +141,7 @@ def against_mitsuba(extent: Extent) -> Iterator[Pair]:
 
 def other_ways(extent: Extent) -> Iterator[Pair]:
     """Yield searches by our tree against Mitsuba's, and what a plan leaves out."""
-    size: Nodes = {"width": extent.width, "height": extent.height}
+    size: Values = {"width": extent.width, "height": extent.height}
 
     def crowd(kind: str) -> Run:
         return _render(renders.crowd(extent.growth, kind, **size), layers=["depth"])
@@ -167,7 +166,7 @@ def other_ways(extent: Extent) -> Iterator[Pair]:
         yield Pair(name, partial(_render, nodes), whole, 1.05, off, 0.5 / 255, why)
 
 
-def left_out(nodes: Nodes, change: Nodes, more: Nodes) -> Run:
+def left_out(nodes: Values, change: Values, more: Values) -> Run:
     """A render of a scene with what its plan leaves out."""
     return _render(nodes | change, **more)
 

@@ -16,7 +16,7 @@ from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.studies.speed import DIRECT
 from mrt_mitsuba.validation.tools.compare import p_values
 from mrt_mitsuba.validation.tools.scenery import AT_CENTRES, with_materials
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.tools.study import Study, Values
 
 TITLE = "Against Mitsuba's own integrators, lights and materials"
 
@@ -24,8 +24,6 @@ NEAR = 40.0  # the mesh that stands in for a plane ends at 50
 RENDERS = 8  # enough for a mean and its variance
 # Probability that a comparison calls equal pictures different; seeds are fixed, so it stays passed
 LEVEL = 1e-3
-
-Nodes = dict[str, Any]
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -40,9 +38,9 @@ def direct(study: Study, *, quick: bool) -> None:
     The light is a stock point light with falloff. Mitsuba's shadow rays start 9e-5 (1 + |p|) off their
     surface, ours a few roundings: single pixels differ at the edges of shadows, as they do at outlines.
     """
-    size: Nodes = {"width": 120, "height": 90} if quick else {"width": 320, "height": 240}
+    size: Values = {"width": 120, "height": 90} if quick else {"width": 320, "height": 240}
     figures = ("median difference", "share of pixels off by > 1e-5", "share of pixels that a light reaches")
-    rows: list[Nodes] = []
+    rows: list[Values] = []
     for number in study.each("Direct light", (0, 1, 2, 3) if quick else (0, 1, 2, 3, 4)):
         whole = report_scene(number)
         found = []
@@ -78,9 +76,9 @@ def gloss(study: Study, *, quick: bool) -> None:
     y, x = np.mgrid[:64, :128] / 64 * np.pi
     waves = np.stack([1 + 0.8 * np.sin(3 * x + phase) * np.sin(y) for phase in (0, 2, 4)], axis=-1)  # smooth
 
-    def spheres(alpha: float) -> Nodes:
+    def spheres(alpha: float) -> Values:
         """Four black, shiny spheres in a smooth environment."""
-        black: Nodes = {"alpha": alpha, "ior": 3.0, "diffuse": (0, 0, 0), "specular": (1, 1, 1)}
+        black: Values = {"alpha": alpha, "ior": 3.0, "diffuse": (0, 0, 0), "specular": (1, 1, 1)}
         scene = with_materials(report_scene(0), partial(replace, **black))
         nodes = replace(scene, planes=(), lights=()).to_dict(width=width, height=height, fresnel="dielectric")
         return nodes | {"sky": {"type": "envmap", "bitmap": mi.Bitmap(np.float32(waves))}}
@@ -108,15 +106,15 @@ def physical(m: Material) -> Material:
     return replace(m, alpha=max(abs(m.alpha), 0.1), specular=(r, g, b), diffuse=(0.0, 0.0, 0.0))
 
 
-def changed(nodes: Nodes, key: str, change: Callable[[Any], Any]) -> Nodes:
+def changed(nodes: Values, key: str, change: Callable[[Any], Any]) -> Values:
     """The nodes with a parameter changed wherever one has it."""
     return {n: node | {key: change(node[key])} if key in node else node for n, node in nodes.items()}
 
 
-def mistakes(nodes: Nodes) -> dict[str, Nodes]:
+def mistakes(nodes: Values) -> dict[str, Values]:
     """The nodes with a mistake, by its name."""
 
-    def brighter(color: Nodes) -> Nodes:
+    def brighter(color: Values) -> Values:
         return color | {"value": [1.02 * x for x in color["value"]]}
 
     def rougher(alpha: float) -> float:
@@ -136,11 +134,11 @@ def mistakes(nodes: Nodes) -> dict[str, Nodes]:
 
 def whole_scenes(study: Study, *, quick: bool) -> None:
     """Compare the report's scenes under path, with their gloss alone; with mistakes they must differ."""
-    size: Nodes = {"width": 64, "height": 48} if quick else {"width": 120, "height": 90}
-    options: Nodes = {"integrator": {"type": "path", "max_depth": 4}, "spp": 16 if quick else 64}
-    rows: list[Nodes] = []
+    size: Values = {"width": 64, "height": 48} if quick else {"width": 120, "height": 90}
+    options: Values = {"integrator": {"type": "path", "max_depth": 4}, "spp": 16 if quick else 64}
+    rows: list[Values] = []
 
-    def renders(nodes: Nodes, seed: int) -> np.ndarray:
+    def renders(nodes: Values, seed: int) -> np.ndarray:
         """Independent renders through the pixels' centres, ``RENDERS`` of them."""
         scene = mi.load_dict(nodes)
         seeds = range(seed, seed + RENDERS)

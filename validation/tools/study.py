@@ -215,7 +215,7 @@ def ratio(run: Run, other: Run, *, repeats: int) -> dict[str, float]:
     return ratio_of(*in_turns(sides, repeats))
 
 
-def timed_in_turns(sides: Sequence[Callable[[int], Item]], turns: int) -> list[tuple[list[Item], np.ndarray]]:
+def timed_in_turns(sides: Sequence[Callable[[int], Any]], turns: int) -> list[tuple[list[Any], np.ndarray]]:
     """The results of each side, see ``in_turns``, and their seconds [turns].
 
     Each side runs once before, which compiles its kernels.
