@@ -96,7 +96,10 @@ def measured(scene: Any, seeds: int, truth_rays: int) -> dict[str, Any]:
 
 
 def by_tenths(stated: Array, true: Array) -> tuple[Array, Array]:
-    """The roots of the means of squared errors, in tenths of them sorted by the stated ones. [10] each"""
+    """The root mean squares of stated and true errors [10] in tenths, sorted by the stated ones.
+
+    Both are given as squares, in arrays of one shape.
+    """
     order = np.array_split(np.argsort(stated, axis=None), 10)
 
     def errors(squares: Array) -> Array:
