@@ -106,7 +106,7 @@ class State:
     scouts: Stack | None  #: as a filter has them; None under a box
     bad: np.ndarray  #: met a ray whose colour is no number, or has no square, [H, W]
     unfit: float  #: the largest of such colours
-    earlier: tuple[float, np.ndarray] | None  #: mean rays and ``differences`` of the halves, a round before
+    earlier: np.ndarray | None  #: ``differences`` of the halves a round before, [2, H, W]
     exposures: int  #: number of them
 
     @classmethod
@@ -325,7 +325,7 @@ class RayNoise:
         scouts = state.scouts
         earlier = None
         if state.rays.all():
-            earlier = float(state.rays[0].mean()), state.differing
+            earlier = state.differing
         with np.errstate(invalid="ignore"):
             halves = state.halves.plus(exposed, chosen[:2] > 0)
             if scouts is not None:
@@ -478,17 +478,18 @@ class RayNoise:
         return chosen
 
     def _gain(self, state: State, among: np.ndarray) -> float:
-        """By what power of the rays, beyond the first, variance falls in some pixels [H, W]: as it fell since
-        the round before."""
+        """By what power of the rays, beyond the first, variance falls in some pixels [H, W]: since the round
+        before, it has fallen by one power of what it would have done with independent rays."""
         if state.earlier is None:
             return 0.0
-        rays, earlier = state.earlier
         weights = among.ravel().astype(np.float32)
-        now, then = (values.reshape(2, -1) @ weights for values in (state.differing, earlier))
-        growth = float(state.rays[0].mean()) / rays
-        if min(*now, *then) <= 0 or growth < 1.5:  # less tells nothing
+        now, then = (values.reshape(2, -1) @ weights for values in (state.differing, state.earlier))
+        if min(*now, *then) <= 0:
             return 0.0
-        power = math.log(then[0] / then[1] * now[1] / now[0]) / math.log(growth)
+        found, expected = np.log(then / now)
+        if expected < math.log(1.5):  # fewer tell nothing
+            return 0.0
+        power = float(found / expected) - 1
         return KEPT * min(max(power, 0.0), self._sampler.gain)
 
     def _room(self, state: State, most: float) -> float:
