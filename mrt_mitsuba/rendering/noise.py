@@ -32,20 +32,21 @@ from mrt_mitsuba.rendering.progress import Advance
 
 HALVES, SCOUTS = [0, 1], [2, 3]
 SUSPECT = 0.5  # shape of a tail where rare rays may rule
-MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too high
-MARGIN_FILTERED = 0.93  # where pixels share rays, and so no field can tell what another one takes
+MARGIN = 0.93  # of the target to aim at: a forecast is as often too low as too high
 EVENLY = 0.2  # of the pixels make up noise that is even
 TILE = 16  # pixels that round alike, under a filter: it has rays traced around all that need some
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
 JUDGES = 2**11  # pixels, about, that choose the mixture
 RANKED = 2**12  # pixels, about, by which tenths are found
+LEVELS = 64  # of errors, by which a power of them is found
 LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB
 MISSED = 0.25  # of a pixel like those that make up the noise: it may be among the others, unseen
 STATED = 2  # squared errors that a stated variance counts as much as
 KEPT = 0.75  # of the power by which sequences gain: it falls with their length
 LEAST_RATIO = 0.05  # of squared errors to stated variances, to be believed: rare ones may be missing
-ROUND_TRIPS = 8  # until shares of whole groups fit what there is room for
+ROUND_TRIPS = 8  # for shares of whole groups to fill the room, once they fit into it
 FULL = 0.995  # of the room is all of it
+ALMOST = 0.9975  # of the room is aimed at, for shares to be less than it and enough
 
 Blurred = Callable[[np.ndarray], np.ndarray]
 
@@ -208,6 +209,7 @@ class Noise(Protocol):
     film: Film
     blurred: Blurred | None  #: what is done to the picture in the end, by which errors are judged
     margin: float  #: of a target to aim at
+    gain: float  #: by what power of the rays variance may fall beyond the first
     least: float  #: mean rays of a pixel that a target takes at least, in a small picture
     begin: np.ndarray  #: what to trace first
 
@@ -278,18 +280,19 @@ def estimate(noise: Noise, state: State) -> ErrorEstimate:
 class RayNoise:
     """The noise of rays, each in a pixel that is chosen for it. See ``Noise``."""
 
+    margin = MARGIN
     least = 256.0
     scouting = (1 / 15, 1 / 4)  #: rays of scouts over those of halves; where rare rays may rule
 
     def __init__(self, exposer: Exposer, seed: int, blurred: Blurred | None = None) -> None:
         self.film: Film = exposer.film
         self.blurred = blurred
-        self.margin = MARGIN_FILTERED if self.film.reach else MARGIN
         self._exposer = exposer
         self._seed = seed
         samplers = plugin("samplers", "mrt_mitsuba.rays")
         self._sampler = mi.load_dict({"type": samplers.ADAPTIVE})
         self._group = self._sampler.group
+        self.gain: float = self._sampler.gain
         self.begin = np.ones((4, self.film.pixels), np.int64)
         # under a filter, pixels share rays
         fields = 1 if self.film.reach else self._sampler.fields
@@ -448,8 +451,9 @@ class RayNoise:
         return np.stack([half, half, scouts, scouts])
 
     def last_shares(self, state: State, most: float, target: float | None) -> np.ndarray:
-        """How much less a sequence errs, the halves show best: in pixels of the other colour of a chessboard,
-        so that no value moves its own weight."""
+        """A half's own rays show best how unequal errors are, and the halves' difference how much less a
+        sequence errs: both in pixels of the other colour of a chessboard, so that no value moves its own
+        weight."""
         room = self._room(state, most) / 2
         rounding = self._rounding(state)
         scouts = state.sums(*SCOUTS)
@@ -457,15 +461,19 @@ class RayNoise:
         near = None if alone else np.stack([_nearby(state.differing * ~f, WINDOWS[2:]) for f in self._fields])
         # of a ray's variance in the squares of the halves' difference
         weight = np.float32((1 / state.rays[HALVES]).sum(0) / (4 * state.unit))
+        found, expected = state.differing
         chosen = np.zeros((4, self.film.pixels), np.int64)
         for index in HALVES:
             have = state.rays[index]
             views = self._variance_of_rays(state, state.sums(1 - index), scouts, near)
+            # squared errors by the half's own rays, which the other half has not met, unlike their difference
+            own = state.sums(index).variance * (weight * np.float32(state.unit))
+            own *= found / np.maximum(expected, 1e-30)
             for field, variance in zip(self._fields, views.reshape(-1, *self.film.shape), strict=True):
                 gain = 0.0
                 if near is not None:
-                    errors = _calibrated(variance * weight, state.differing[0], ~field)
-                    drawn = _drawn(errors[~field], state.differing[0][~field])
+                    errors = _levelled(variance * weight, own, ~field)
+                    drawn = _drawn(errors[~field], found[~field])
                     variance = errors * drawn / weight
                     gain = self._gain(state, ~field)
                 deviation = _smoothed(variance)
@@ -490,7 +498,7 @@ class RayNoise:
         if expected < math.log(1.5):  # fewer tell nothing
             return 0.0
         power = float(found / expected) - 1
-        return KEPT * min(max(power, 0.0), self._sampler.gain)
+        return KEPT * min(max(power, 0.0), self.gain)
 
     def _room(self, state: State, most: float) -> float:
         return most * self.film.pixels - float(state.rays.sum())
@@ -520,7 +528,9 @@ class RayNoise:
         low = 0.0
         high = min(factor, (room + known) / deviation.sum())
         factor = min(factor, _factor(deviation, None, have, room, 0.0))
-        for _ in range(ROUND_TRIPS):
+        trips = 0
+        while low == 0 or trips < ROUND_TRIPS:
+            trips += 1
             groups = np.zeros(self.film.pixels, np.int64)
             groups[some] = self._due(factor * deviation, have, rounding)
             cost = self._group * float(widened(self.film, groups[None]).sum())
@@ -531,8 +541,8 @@ class RayNoise:
                     break
             else:
                 high = factor
-            factor *= (room + known) / (cost + known)
-            if not low < factor < high:
+            factor *= (ALMOST * room + known) / (cost + known)
+            if trips > ROUND_TRIPS or not low < factor < high:
                 factor = (low + high) / 2
         return best
 
@@ -604,11 +614,11 @@ def _mixture(parts: np.ndarray, measured: np.ndarray) -> np.ndarray:
     return shares
 
 
-def _calibrated(variance: np.ndarray, squares: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
+def _calibrated(variance: np.ndarray, squares: np.ndarray) -> np.ndarray:
     """Variances [H, W], each tenth of them, as they sort, drawn to the mean of its squared errors.
 
     The more squares make up that mean, the more: a tenth in which both halves missed the same rare rays has
-    none, and keeps what was stated. ``among``: the pixels whose squares count, [H, W]; None: all.
+    none, and keeps what was stated.
     """
     noisy = variance > 0
     if not noisy.any():
@@ -616,15 +626,35 @@ def _calibrated(variance: np.ndarray, squares: np.ndarray, among: np.ndarray | N
     step = max(1, variance.size // RANKED)
     edges = np.quantile(variance[noisy][::step], np.arange(1, 10) / 10)
     tenth = np.searchsorted(edges, variance)  # of each pixel, 0 to 9
-    judging = noisy if among is None else noisy & among
-    judged = tenth[judging]
-    errors = squares[judging].astype(np.float64)
-    stated = np.bincount(judged, variance[judging], 10)
-    measured = np.bincount(judged, errors, 10)
-    number = measured**2 / np.maximum(np.bincount(judged, np.square(errors), 10), 1e-300)
+    of_noisy = tenth[noisy]
+    errors = squares[noisy].astype(np.float64)
+    stated = np.bincount(of_noisy, variance[noisy], 10)
+    measured = np.bincount(of_noisy, errors, 10)
+    number = measured**2 / np.maximum(np.bincount(of_noisy, np.square(errors), 10), 1e-300)
     ratio = np.maximum(measured / np.maximum(stated, 1e-300), LEAST_RATIO)
     drawn = ratio ** (number / (number + STATED))
     return np.asarray(variance * drawn[tenth])
+
+
+def _levelled(stated: np.ndarray, measured: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Squared errors [H, W], taken to the power that makes them as unequal as errors measured independently.
+
+    Pixels that met a rare bright ray are less noisy than they look, and those that met none are noisier.
+    The mean logarithm of an error, weighted by the errors, says how unequal they are. ``among``: the pixels
+    that are compared, [H, W]; the sum over them stays.
+    """
+    compared = among & (stated > 0)
+    logs = np.log(stated[compared])
+    weights = measured[compared].astype(np.float64)
+    if not weights.any():
+        return stated
+    counts, edges = np.histogram(logs, LEVELS)
+    middles = (edges[1:] + edges[:-1]) / 2
+    powers = np.linspace(0.1, 1.5, 29)
+    means = [np.average(middles, weights=counts * np.exp(power * (middles - edges[-1]))) for power in powers]
+    power = np.interp(np.average(logs, weights=weights), means, powers)
+    levelled = stated ** np.float32(power)
+    return np.asarray(levelled * (stated[among].sum() / max(levelled[among].sum(), 1e-30)))
 
 
 def _drawn(stated: np.ndarray, measured: np.ndarray) -> float:

@@ -119,6 +119,8 @@ def _next(
         aim = None
     elif wanted <= most:
         return Next(noise.last_shares(state, rays, aim), last=True)
+    elif aim is not None:  # no more than it takes where variance falls as fast as it may
+        most = min(most, spp * (wanted / spp) ** (1 / (1 + noise.gain)))
     if most >= rays:
         return Next(noise.last_shares(state, rays, aim), last=True)
     return Next(noise.shares(state, forecast, most, even), False, doubled)

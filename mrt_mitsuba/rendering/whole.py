@@ -68,6 +68,7 @@ class PictureNoise:
     """
 
     margin = MARGIN
+    gain = 0.0
     least = 64.0
     scouting = 1 / 8  #: rays of scouts over those of halves
 

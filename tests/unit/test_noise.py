@@ -305,3 +305,19 @@ def test_noise_of_any_size_ends_without_a_warning_of_numpy():
     with pytest.warns(mrt.MrtWarning):
         bright = _render(Draws(_rare(0.02, bright=1e12)), target=1e-6, rays=64)
     assert bright.rounds[-1].spp <= 64
+
+
+@pytest.mark.parametrize(("rfilter", "least"), [("box", 0.95), ("gaussian", 0.8)])  # shared out in tiles
+def test_shares_take_all_the_room_there_is_and_no_more(rfilter, least):
+    """They are whole groups, found by trial: none may be left without any because a trial costs too much."""
+
+    def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
+        return (0.1 + (pixel % SIDE == 3) + (pixel < 2 * SIDE)) * rng.normal(size=len(pixel))
+
+    noise = RayNoise(Draws(draw, rfilter=rfilter), seed=0)  # type: ignore[arg-type]
+    state = noise.trace(noise.blank(), noise.begin, lambda rays: None)
+    forecast = noise.forecast(state)
+    for most in np.linspace(20, 40, 101):
+        for chosen in (noise.shares(state, forecast, most, 0.25), noise.last_shares(state, most, None)):
+            taken = (noise.cost(chosen) / PIXELS + 8) / most
+            assert least < taken <= 1.005, most  # scouts are rounded by themselves
