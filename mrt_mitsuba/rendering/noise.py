@@ -468,7 +468,7 @@ class RayNoise:
             views = self._variance_of_rays(state, state.sums(1 - index), scouts, near)
             # squared errors by the half's own rays, which the other half has not met, unlike their difference
             own = state.sums(index).variance * (weight * np.float32(state.unit))
-            own *= found / np.maximum(expected, 1e-30)
+            own *= np.divide(found, expected, out=np.zeros_like(own), where=expected > 0)
             for field, variance in zip(self._fields, views.reshape(-1, *self.film.shape), strict=True):
                 gain = 0.0
                 if near is not None:
