@@ -32,7 +32,8 @@ from mrt_mitsuba.rendering.progress import Advance
 
 HALVES, SCOUTS = [0, 1], [2, 3]
 SUSPECT = 0.5  # shape of a tail where rare rays may rule
-MARGIN = 0.93  # of the target to aim at: a forecast is as often too low as too high
+MARGIN = 0.95  # of the target to aim at: a forecast is as often too low as too high
+MARGIN_FILTERED = 0.93  # where pixels share rays, and so no field can tell what another one takes
 EVENLY = 0.2  # of the pixels make up noise that is even
 TILE = 16  # pixels that round alike, under a filter: it has rays traced around all that need some
 WINDOWS = (1, 2, 4, 8)  # half the widths of windows that pixels borrow from
@@ -280,13 +281,13 @@ def estimate(noise: Noise, state: State) -> ErrorEstimate:
 class RayNoise:
     """The noise of rays, each in a pixel that is chosen for it. See ``Noise``."""
 
-    margin = MARGIN
     least = 256.0
     scouting = (1 / 15, 1 / 4)  #: rays of scouts over those of halves; where rare rays may rule
 
     def __init__(self, exposer: Exposer, seed: int, blurred: Blurred | None = None) -> None:
         self.film: Film = exposer.film
         self.blurred = blurred
+        self.margin = MARGIN_FILTERED if self.film.reach else MARGIN
         self._exposer = exposer
         self._seed = seed
         samplers = plugin("samplers", "mrt_mitsuba.rays")
@@ -644,7 +645,7 @@ def _levelled(stated: np.ndarray, measured: np.ndarray, among: np.ndarray) -> np
     that are compared, [H, W]; the sum over them stays.
     """
     compared = among & (stated > 0)
-    logs = np.log(stated[compared])
+    logs = np.log(stated[compared], dtype=np.float64)
     weights = measured[compared].astype(np.float64)
     if not weights.any():
         return stated

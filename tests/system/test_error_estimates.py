@@ -194,6 +194,6 @@ def test_a_film_may_be_smaller_than_a_chessboard(size, rfilter, goal):
 
 def test_a_header_says_that_an_error_has_no_upper_end():
     with pytest.warns(mrt.MrtWarning, match="a few rays rule the error"):
-        result = mrt.render(camera(24, 16), integrator=noise(rare=0.0005), aamode="noise", spp=64, seed=2)
+        result = mrt.render(camera(24, 16), integrator=noise(rare=0.0005), aamode="noise", spp=64, seed=1)
     assert result.error.high == math.inf
     assert result.header()["mrt:error"]["high"] is None
