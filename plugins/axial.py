@@ -77,6 +77,7 @@ class AxialMesh(mi.Mesh):
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         if not set(self.parameters).isdisjoint(keys):
+            dr.make_opaque(list(self.parameters.values()))  # data of kernels: new values need no new one
             self._place(*self.parameters.values())
             if is_jit():
                 self._follow(self._frame())

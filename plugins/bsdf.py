@@ -16,7 +16,7 @@ from .fresnel import f0_from_ior
 from .kernel_plan import GRADIENTS, VARYING, Mirror
 from .lobes import LOBES, NUMBERS, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
-from .variants import first, is_jit, largest, updatable, varies
+from .variants import first, largest, plain, updatable, varies
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 
@@ -114,7 +114,7 @@ class MrtBSDF(mi.BSDF):
         parameter = self.parameters[name]
         if isinstance(parameter, mi.Texture):
             return parameter.eval_1(si, active) if name in NUMBERS else parameter.eval(si, active)
-        return parameter if is_jit() else first(parameter)
+        return plain(parameter)
 
     def lobes(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Lobes:
         """Return the lobes at a surface point."""

@@ -72,7 +72,7 @@ class MrtLight(mi.Emitter):
     @staticmethod
     def arriving(d: mi.Vector3f, intensity: mi.UnpolarizedSpectrum, *more: mi.Vector3f) -> Any:
         """Return the irradiance, at normal incidence, of a point that sees the light along the unit vector
-        ``d``.
+        ``d``; at most ``intensity``.
 
         The other arguments are the vectors of ``row`` after the position.
         """

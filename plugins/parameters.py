@@ -33,16 +33,22 @@ def _without_tiny(value: float) -> float:
 
 
 def number(
-    props: mi.Properties, name: str, default: float, *, above: float = -math.inf, least: float = -math.inf
+    props: mi.Properties,
+    name: str,
+    default: float,
+    *,
+    above: float = -math.inf,
+    least: float = -math.inf,
+    most: float = math.inf,
 ) -> float:
-    """Return a finite float parameter, > ``above`` and >= ``least``."""
+    """Return a finite float parameter, > ``above``, >= ``least`` and <= ``most``."""
     value = props.get(name, default)
-    bounds = ((">", above), (">=", least))
-    limits = "".join(f" {sign} {bound:g}" for sign, bound in bounds if bound > -math.inf)
+    bounds = ((">", above), (">=", least), ("<=", most))
+    limits = " and".join(f" {sign} {bound:g}" for sign, bound in bounds if math.isfinite(bound))
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         _fail(props, name, value, f"a number{limits}")
     rounded = _without_tiny(value)
-    if not (abs(rounded) <= LARGEST and rounded > above and rounded >= least):
+    if not (abs(rounded) <= LARGEST and rounded > above and least <= rounded <= most):
         _fail(props, name, value, f"a finite number{limits}")
     return rounded
 

@@ -34,6 +34,13 @@ def updatable(number: float) -> mi.Float:
     return mi.Float(number) if is_jit() else dr.scalar.Array1f64(number)
 
 
+def plain(number: mi.Float) -> mi.Float:
+    """Return an ``updatable`` parameter as a number to compute with: in vectorised variants the array itself,
+    as a single entry would have no derivative.
+    """
+    return number if is_jit() else first(number)
+
+
 def but_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
     """Return ``mask & ~excluded``; on a Python bool, ~ gives a number."""
     return mask & ~excluded if is_jit() else mask and not excluded

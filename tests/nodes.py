@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba.plugins import class_of
 from mrt_mitsuba.plugins.table import Plugin
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
@@ -52,3 +54,9 @@ def example(row: Plugin, **more: Any) -> dict[str, Any]:
     """A plugin of the table with the parameters of its sample."""
     values = {k: mi.Bitmap(v) if isinstance(v, np.ndarray) else v for k, v in row.sample.items()}
     return {"type": row.name, **values, **more}
+
+
+def documented(row: Plugin) -> dict[str, str]:
+    """The parameters of a plugin, and the first word of the type of each, from its class's docstring."""
+    _, *tables, _ = re.split(r"^ *=+ =.*$", class_of(row).__doc__ or "", flags=re.MULTILINE)
+    return dict(re.findall(r"^ *``(\w+)`` +`*(\w+)", "".join(tables), flags=re.MULTILINE))

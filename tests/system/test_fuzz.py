@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from nodes import example
+from nodes import documented, example
 from PIL import Image
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba import plugins
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.plugins.table import PLUGINS
 from mrt_mitsuba.scene.open import open_scene
@@ -139,19 +138,12 @@ simple = st.booleans() | st.integers(-3, 300) | st.text(max_size=6)
 values = numbers | simple | vectors | colors
 
 
-def documented(row):
-    """The parameters of a plugin, as the table in the docstring of its class names them."""
-    docstring = getattr(plugins.plugin(row.module), row.class_name).__doc__
-    _, *tables, _ = re.split(r"^ *=+ =.*$", docstring, flags=re.MULTILINE)
-    return re.findall(r"^ *``(\w+)``", "".join(tables), flags=re.MULTILINE)
-
-
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_parameter_is_taken_or_refused_by_name(variant, data):
     row = data.draw(st.sampled_from(PLUGINS))
     plugin = row.name
-    name = data.draw(st.sampled_from(documented(row)))
+    name = data.draw(st.sampled_from(list(documented(row))))
     try:
         mi.load_dict(example(row, **{name: data.draw(values)}))
     except (RuntimeError, TypeError) as error:

@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import sensor
 from numpy.testing import assert_allclose
 
 import mrt_mitsuba as mrt
@@ -238,22 +237,3 @@ def test_mirror_reflectance_is_ks_times_fresnel(form):
     assert max(KS) >= b.mirror_bound().reflectance >= max(KS) * 0.999
     # an F₀ above 1 is allowed, and the bound knows
     assert bsdf(f0=rgb((3, 1, 1))).mirror_bound().reflectance >= 2.99
-
-
-def test_new_values_of_a_material_need_no_new_kernel():
-    """They are data of the kernels, whichever integrator draws it."""
-    nodes = {"type": "scene", "integrator": {"type": "direct"}, "light": {"type": "point"}}
-    nodes["sensor"] = sensor([0, 0, 5], [0, 0, 0], (8, 6))
-    nodes["floor"] = {"type": "rectangle", "bsdf": {"type": "mrt_bsdf"}}
-    scene = mi.load_dict(nodes)
-    parameters = mi.traverse(scene)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for alpha in (0.125, 0.25, 0.375):
-            parameters["floor.bsdf.alpha"] = alpha
-            parameters["floor.bsdf.int_ior"] = 1 + alpha
-            parameters.update()
-            dr.kernel_history_clear()
-            dr.eval(mi.render(scene, spp=1))
-    kernels = dr.kernel_history([dr.KernelType.JIT])  # of the last picture
-    assert kernels
-    assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,10 +10,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import mesh, sensor
+from nodes import example, mesh, sensor
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mrt_mitsuba.plugins import plugin
+from mrt_mitsuba.plugins.parameters import number, vector
+from mrt_mitsuba.plugins.table import PLUGINS
+from mrt_mitsuba.plugins.variants import plain, updatable
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -86,16 +89,35 @@ def test_light_tracing_is_refused_where_there_is_one():
         tracer.render(mi.load_dict(box | {"other": other}), spp=4)
 
 
-def test_other_kinds_of_lights_join_the_table():
-    """Next to ``mrt_light``, and by themselves: the picture is that of calls to each."""
+@pytest.fixture
+def other_lights(variant):
+    """Two more lights of the kernels' table; the first is the model that CONTRIBUTING.md names."""
 
     class LeaningLight(plugin("light").MrtLight):  # type: ignore[misc]
-        def row(self, it: Any, active: Any = True) -> list[Any]:
-            return [*super().row(it, active), mi.Vector3f(0.6, 0, 0.8)]
+        """Brightest along ``axis``, from the light outwards; dark from where the cosine falls to ``edge``."""
+
+        def __init__(self, props: mi.Properties) -> None:
+            super().__init__(props)
+            self.axis = mi.Vector3f(vector(props, "axis", (-0.6, 0, -0.8), nonzero=True))
+            self.edge = updatable(number(props, "edge", 0.5, least=0, most=0.99))
+            self.parameters_changed()
+
+        def traverse(self, callback: mi.TraversalCallback) -> None:
+            super().traverse(callback)
+            callback.put("axis", self.axis, mi.ParamFlags.Differentiable)
+            callback.put("edge", self.edge, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+            super().parameters_changed(keys)
+            dr.make_opaque(self.axis, self.edge)
+
+        def row(self, it: mi.Interaction3f, active: mi.Bool = True) -> list[Any]:
+            return [*super().row(it, active), self.axis, mi.Vector3f(plain(self.edge))]
 
         @staticmethod
-        def arriving(d: Any, intensity: Any, axis: Any) -> Any:
-            return intensity * dr.clip(2 * dr.dot(d, axis) - 1, 0, 1)
+        def arriving(d: mi.Vector3f, intensity: Any, axis: mi.Vector3f, edge: mi.Vector3f) -> Any:
+            cosine = dr.dot(-d, dr.normalize(axis))
+            return intensity * dr.clip((cosine - edge.x) / (1 - edge.x), 0, 1)
 
     class TintedLight(plugin("light").MrtLight):  # type: ignore[misc]
         def row(self, it: Any, active: Any = True) -> list[Any]:
@@ -107,15 +129,25 @@ def test_other_kinds_of_lights_join_the_table():
 
     mi.register_emitter("leaning", LeaningLight)
     mi.register_emitter("tinted", TintedLight)
-    three = ["tinted", "mrt_light", "leaning"]
-    for kinds in (["leaning"], ["mrt_light", "leaning"], ["leaning", "mrt_light"], three):
-        used = [kinds[k % len(kinds)] for k in range(9)]
+
+
+LIGHTS = [row for row in PLUGINS if row.table == "lights"]
+
+
+@pytest.mark.usefixtures("other_lights")
+@pytest.mark.parametrize("row", LIGHTS, ids=lambda row: row.name)
+def test_lights_of_the_table_are_those_of_calls(row):
+    """Each by itself and next to others, with some on each of the six sides of a ball."""
+    one, leaning, tinted = example(row), {"type": "leaning"}, {"type": "tinted"}
+    for kinds in ([one], [leaning], [one, leaning], [leaning, one], [tinted, one, leaning]):
         nodes: dict[str, Any] = {"type": "scene"}
         nodes["integrator"] = {"type": "mrt_whitted", "max_depth": 1, "min_contribution": 0.0}
-        nodes["sensor"] = sensor([0, 0, 5], [0, 0, 0], (32, 24))
-        nodes["floor"] = {"type": "mrt_plane", "normal": [0, 0, 1], "bsdf": {"type": "mrt_bsdf"}}
-        for k, kind in enumerate(used):
-            nodes[f"light{k}"] = light(type=kind, position=[k - 4, 0, 3], intensity=0.1)
+        nodes["sensor"] = sensor([3, 4, 2], [0, 0, 0], (32, 24))
+        nodes["ball"] = {"type": "sphere", "bsdf": {"type": "mrt_bsdf"}}
+        sides = np.repeat([*np.eye(3), *-np.eye(3)], 3, axis=0)
+        for k, side in enumerate(sides):
+            common = {"position": (3 * side).tolist(), "intensity": 0.1}
+            nodes[f"light{k}"] = kinds[k % len(kinds)] | common
         scene = mi.load_dict(nodes)
         image = np.array(mi.render(scene, spp=1))
         integrator = scene.integrator()
@@ -124,6 +156,20 @@ def test_other_kinds_of_lights_join_the_table():
         assert image.std() > 1e-3
         integrator.kernel_plan = lambda facts, plan=plan: replace(plan, lights="loop")
         assert_allclose(image, np.array(mi.render(scene, spp=1)), atol=1e-6)
+
+
+@in_variants
+@pytest.mark.usefixtures("other_lights")
+def test_parameters_of_other_lights_are_checked_and_can_be_updated(variant):
+    with pytest.raises(Exception, match=r"edge.* is 2\.0, but must be a finite number >= 0 and <= 0\.99"):
+        light(type="leaning", edge=2.0)
+    it = light(type="leaning", position=[0, 0, 2])
+    parameters = mi.traverse(it)
+    parameters["axis"] = [0, 2, -2]
+    parameters["edge"] = 0.25
+    parameters.update()
+    _, weight = it.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
+    assert_allclose(spectrum(weight), stock_spectrum(1.0) * (0.5**0.5 - 0.25) / 0.75, rtol=1e-6)
 
 
 @in_variants
@@ -209,21 +255,3 @@ def test_a_light_on_a_surface_shines_at_every_scale(name):
         assert (other != image).any(axis=-1).mean() < 1e-3  # a pixel at a shadow's edge
     # From that much higher, the sphere's horizon is 0.045 radii away
     assert (above | below != image).any(axis=-1).mean() < 0.03
-
-
-def test_a_moved_light_needs_no_new_kernel():
-    """Its place is data of the kernels, whichever integrator draws it."""
-    nodes = {"type": "scene", "integrator": {"type": "direct"}, "light": {"type": "mrt_light"}}
-    nodes["sensor"] = sensor([0, 0, 5], [0, 0, 0], (8, 6))
-    nodes["floor"] = {"type": "rectangle"}
-    scene = mi.load_dict(nodes)
-    parameters = mi.traverse(scene)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for place in ([1, 0, 2], [0, 1, 2], [0.5, 0.25, 3]):
-            parameters["light.position"] = place
-            parameters.update()
-            dr.kernel_history_clear()
-            dr.eval(mi.render(scene, spp=1))
-    kernels = dr.kernel_history([dr.KernelType.JIT])  # of the last picture
-    assert kernels
-    assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from nodes import example, sensor
+from nodes import documented, example, sensor
+from numpy.testing import assert_allclose
 
 from mrt_mitsuba import plugins
 from mrt_mitsuba.plugins import facts
 from mrt_mitsuba.plugins.lobes import LOBES, Lobes, Pair
 from mrt_mitsuba.plugins.materials import material_rows
 from mrt_mitsuba.plugins.snapshot import Kept, Snapshot
-from mrt_mitsuba.plugins.table import PLUGINS, names_in
+from mrt_mitsuba.plugins.table import PLUGINS, Plugin, names_in
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -67,6 +69,98 @@ def test_a_parameter_is_used_or_refused(row, name):
         nodes["thing"] = example(row, **given, bsdf={"type": "mrt_bsdf", "alpha": 0.4})
         pictures.append(drawn(nodes))
     assert abs(pictures[0] - pictures[1]).max() > 1e-3
+
+
+in_both = pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+
+
+def another(value: Any) -> Any:
+    """Another value of the same type: nearer to 0, and so in most ranges, or 0.5 in place of 0."""
+    return type(value)(dr.select(value == 0, 0.5, 0.7 * value))
+
+
+@in_both
+@each_plugin
+def test_every_number_that_traverse_lists_can_be_set(row, variant):
+    made = mi.load_dict(example(row))
+    parameters = mi.traverse(made)
+    for key, value in dict(parameters).items():
+        if "Transform" not in type(value).__name__ and dr.is_float_v(value) and dr.width(value):
+            expected = another(value)
+            parameters[key] = expected
+            parameters.update()
+            assert_allclose(mi.traverse(made)[key], expected, rtol=1e-6)
+
+
+# Read when the plugin is made, and never again
+FIXED = {"mrt_plane": {"normal", "distance", "extent"}, "mrt_whitted": {"sky", "min_contribution"}}
+
+
+def numbers_in_traverse(row: Plugin) -> list[str]:
+    """Return the parameters of numbers that the plugin's documentation names, without those of ``FIXED``."""
+    kinds = ("float", "point", "vector", "spectrum")
+    names = [name for name, kind in documented(row).items() if kind in kinds]
+    assert FIXED.get(row.name, set()) <= set(names)
+    return [name for name in names if name not in FIXED.get(row.name, ())]
+
+
+def optional(name: str) -> dict[str, float]:
+    """A parameter that is there only where it has a value, with one."""
+    return {name: 0.3} if name == "f0" else {}
+
+
+def room(row: Plugin, integrator: str, **more: Any) -> dict[str, Any]:
+    """A hollow ball with a plugin, the "thing"; from its wall one sees all that shines out of its centre."""
+    ball = {"type": "sphere", "radius": 4, "flip_normals": True}
+    nodes = {"type": "scene", "integrator": {"type": integrator}, "ball": ball}
+    nodes["sensor"] = sensor([2.2, 2.2, 2.2], [0, 0, 0], (24, 16), fov=140)
+    thing = example(row, **more)
+    if row.kind == "bsdf":
+        ball["bsdf"] = thing
+    else:
+        nodes["thing"] = thing
+    if row.kind != "emitter":
+        nodes["light"] = {"type": "point", "position": [1, 2, 0.5], "intensity": 9}
+    return nodes
+
+
+def set_another(scene: mi.Scene, name: str) -> float | list[float]:
+    """Give the plugin another value of a parameter, as plain numbers, and return it."""
+    parameters = mi.traverse(scene)
+    keys = [key for key in dict(parameters) if re.search(rf"\b(bsdf|thing)\.{name}(\.value)?$", key)]
+    assert keys, f"traverse leaves out {name}"
+    numbers = np.ravel(another(parameters[keys[0]])).tolist()
+    value = numbers if len(numbers) > 1 else numbers[0]
+    parameters[keys[0]] = value
+    parameters.update()
+    return value
+
+
+@in_both
+@pytest.mark.parametrize("integrator", ["direct", "mrt_whitted"])
+@each_plugin
+def test_a_number_that_was_set_is_that_of_a_new_plugin(row, integrator, variant):
+    for name in numbers_in_traverse(row):
+        scene = mi.load_dict(room(row, integrator, **optional(name)))
+        old = np.array(mi.render(scene, spp=1))
+        new = drawn(room(row, integrator, **{name: set_another(scene, name)}))
+        assert abs(new - old).max() > 1e-3, name
+        assert_allclose(np.array(mi.render(scene, spp=1)), new, atol=1e-5)  # vertices in float32
+
+
+@each_plugin
+def test_a_number_that_is_set_needs_no_new_kernel(row):
+    """Numbers are data of the kernels, whichever integrator draws them."""
+    for name in numbers_in_traverse(row):
+        scene = mi.load_dict(room(row, "direct", **optional(name)))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            for _ in range(3):
+                dr.kernel_history_clear()
+                set_another(scene, name)
+                dr.eval(mi.render(scene, spp=1))
+        kernels = dr.kernel_history([dr.KernelType.JIT])  # of the last value and picture
+        assert kernels
+        assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)
 
 
 def test_reasons_name_the_plugins_of_the_table():

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from matte.maths import oren_nayar_cos
 from mrt_mitsuba.plugins.parameters import number
-from mrt_mitsuba.plugins.variants import first, is_jit, updatable
+from mrt_mitsuba.plugins.variants import first, plain, updatable
 
 
 class Matte(mi.BSDF):
@@ -71,9 +71,7 @@ class Matte(mi.BSDF):
         up = mi.Vector3f(0, 0, 1)
         wi = dr.select(active, si.wi, up)
         wo = dr.select(active, wo, up)
-        # As the array that it is: an entry of an array has no derivative
-        sigma = self.sigma if is_jit() else first(self.sigma)
-        cosine = oren_nayar_cos(wi, wo, sigma)
+        cosine = oren_nayar_cos(wi, wo, plain(self.sigma))
         value = self.reflectance.eval(si, active) * cosine
         density = dr.select(active, dr.inv_pi * wo.z, 0)
         return mi.depolarizer(dr.select(active, value, 0)), density
