@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
+import numpy as np
 import pytest
 from cases import Cases
+from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.settings import TABLE, RenderSettings
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -107,6 +110,80 @@ def test_settings_are_the_options_of_render():
     assert taken.pop("scene").default == 0
     held = {field.name: field.default for field in fields(RenderSettings)}
     assert {name: parameter.default for name, parameter in taken.items()} == held
+
+
+UNSEEN = {"memory"}  # it decides how many rays are traced at once, which no picture shows
+# A value of each other option that makes a difference
+VALUES = {
+    "width": 20,
+    "height": 20,
+    "aa": 1,
+    "aamode": "none",
+    "target": 0.5,
+    "maxspp": 64,
+    "maxseconds": 60,
+    "lattice": "centered",
+    "fresnel": "dielectric",
+    "focaldist": 1,
+    "focalrange": 9,
+    "dof": "corrected",
+    "layers": ["normal"],
+    "motion": (1, 0, 0),
+    "motionsamples": 3,
+    "motionmode": "stratified",
+    "convention": "standard",
+    "texturing": "standard",
+    "camera": (0.5, 0.5, 2),
+    "up": (1, 0, 0),
+    "fov": 20,
+    "light": (0, 0, 5),
+    "variant": "scalar_rgb",
+    "seed": 1,
+    "sensor": 1,
+    "spp": 2,
+}
+TARGET = {"target": 0.9}
+MOTION = {"motion": (1, 0, 0)}
+MODEL = {"scene": "model.obj"}
+IN_FRONT = scene(ball={**BALL, "center": [0, 0, 4]})
+# What an option needs to make a difference; the others make one in scene 3
+NEEDED = {
+    "maxspp": TARGET,
+    "maxseconds": TARGET,
+    "motionsamples": MOTION,
+    "motionmode": MOTION,
+    "convention": MODEL,
+    "texturing": MODEL,
+    "camera": MODEL,
+    "up": MODEL,
+    "fov": MODEL,
+    "light": MODEL,
+    "variant": {"aa": 1},
+    "seed": {"integrator": "path"},
+    "sensor": {"scene": {**IN_FRONT, "tele": {**IN_FRONT["sensor"], "fov": 20}}},
+}
+
+
+@pytest.fixture
+def model(tmp_path, monkeypatch):
+    """A triangle with a texture and a mirror, as model.obj in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    Path("model.obj").write_text(f"mtllib model.mtl\n{corners}usemtl m\nf 1/1 2/2 3/3\n")
+    Path("model.mtl").write_text("newmtl m\nKd 1 1 1\nKs 1 1 1\nNi 0.4\nmap_Kd model.png\n")
+    Image.fromarray(np.array([[0, 90], [180, 250]], np.uint8)).convert("RGB").save("model.png")
+
+
+@pytest.mark.parametrize("name", sorted(TABLE.keys() - UNSEEN))
+@pytest.mark.usefixtures("model")
+def test_every_option_makes_a_difference(name):
+    """To the text of the plan or to the picture."""
+    assert name in VALUES, f"VALUES has no value of {name} that makes a difference"
+    options = {"scene": 3, "width": 16, "height": 12} | NEEDED.get(name, {})
+    before = mrt.render(**options)
+    after = mrt.render(**options | {name: VALUES[name]})
+    same = str(before.plan) == str(after.plan) and np.array_equal(before.image, after.image)
+    assert not same, f"{name}={VALUES[name]} makes no difference"
 
 
 NEW_LAYER = """
