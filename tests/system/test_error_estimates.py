@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.machine import Workspace
 from mrt_mitsuba.output.error import tail_shape
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -40,9 +41,9 @@ def _low_digits(number: mi.Float) -> mi.Float:
     return scaled - dr.floor(scaled)
 
 
-def camera(width: int, height: int, rfilter: str = "box") -> mi.Scene:
+def camera(width: int, height: int, rfilter: str = "box", **of_filter: float) -> mi.Scene:
     """A scene of nothing but a camera."""
-    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": rfilter}}
+    film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": rfilter, **of_filter}}
     return mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film}})
 
 
@@ -112,6 +113,47 @@ def test_once_a_half_has_decided_for_the_other_nothing_is_traced(rare, rfilter):
     assert not any((more % 4).any() for more in grown[:-1])
     assert (grown[-1] % 4).any()
     assert result.rounds[-1].spp < 16 / 1.05
+
+
+@pytest.mark.filterwarnings("ignore:a few rays rule the error")
+def test_the_brightest_ray_of_a_pixel_is_known_however_wavefronts_are_cut(monkeypatch):
+    """Of pixels whose rays are traced by twenty at a time: the tail is that of one wavefront, but for sums in
+    another order."""
+    options = {"integrator": noise(rare=0.005), "aamode": "noise", "spp": 128, "seed": 1}
+    scene = camera(6, 4)
+    whole = mrt.render(scene, **options)
+    monkeypatch.setattr(Workspace, "rays_at_once", lambda self, channels: 20)
+    parts = mrt.render(scene, **options)
+    assert parts.kernel_launches > 2 * whole.kernel_launches
+    assert whole.error.tail > 0.3
+    assert parts.error.tail == pytest.approx(whole.error.tail, rel=1e-3)
+
+
+def test_pixels_that_take_rays_take_all_that_the_filter_reaches_from():
+    """The left half is noisy, the right one black: without rays from there, what lies next to it would come
+    out too bright, by a tenth and more."""
+
+    def half(amount: float) -> Any:
+        class Half(mi.SamplingIntegrator):
+            def sample(
+                self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
+            ) -> Any:
+                value = 1 + amount * (2 * _low_digits(sampler.next_1d()) - 1)
+                return mi.Spectrum(dr.select(ray.d.x > 0, value, 0)), mi.Bool(True), []
+
+            def to_string(self) -> str:
+                return "Half[]"
+
+        return Half(mi.Properties())
+
+    scene = camera(40, 48, "gaussian", stddev=2.0)
+    truth = mrt.render(scene, integrator=half(0), aamode="none", spp=1024)
+    found = mrt.render(scene, integrator=half(1), aamode="noise", spp=128)
+    profile = truth.image[..., 0].mean(0)
+    assert (abs(profile - 0.5) < 0.45).sum() >= 4  # the border is as wide as the filter
+    assert np.ptp(found.layers["samples.Y"]) > 32
+    # 48 rows of a hundred rays of deviation 0.6: known to 0.01
+    assert abs(found.image[..., 0].mean(0) - profile).max() < 0.04
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,22 @@ def test_a_scene_renders_by_itself_as_mitsuba_renders_it():
     assert_allclose(mrt.render(scene).image, np.array(mi.render(scene)), atol=1e-4)
 
 
+def test_a_film_of_another_size_shows_the_whole_view():
+    """It loses its crop window within the render, and has it again afterwards."""
+    options = {"integrator": "mrt_whitted", "aa": 1, "lattice": "report", "layers": ["depth"]}
+    nodes: dict[str, Any] = {"type": "scene", "ball": {"type": "sphere", "center": [0.5, 0.25, 0]}}
+    view = sensor([0, 0, 5], [0, 0, 0])
+    whole = mi.load_dict(nodes | {"sensor": view | {"film": {"type": "hdrfilm", "width": 16, "height": 12}}})
+    film = {"type": "hdrfilm", "width": 32, "height": 24}
+    film |= {"crop_offset_x": 8, "crop_offset_y": 6, "crop_width": 20, "crop_height": 12}
+    scene = mi.load_dict(nodes | {"sensor": view | {"film": film}})
+    found = mrt.render(scene, width=16, height=12, **options).layers["depth.Z"]
+    assert_allclose(found, mrt.render(whole, **options).layers["depth.Z"], rtol=1e-5)
+    assert np.isfinite(found).any()
+    after = scene.sensors()[0].film()
+    assert [*after.crop_offset(), *after.crop_size(), *after.size()] == [8, 6, 20, 12, 32, 24]
+
+
 def test_filters_alpha_and_channels_are_kept(tmp_path):
     film = {"rfilter": {"type": "catmullrom"}, "pixel_format": "rgba"}
     integrator = {"type": "aov", "aovs": "far:depth,facing:sh_normal", "picture": {"type": "path"}}
@@ -212,6 +228,36 @@ def test_costs_are_compared_at_equal_error_with_the_fastest(monkeypatch, aim):
     assert reached["warned"] == 0
     study = findings(adaptive.renders_to_an_error, size=96, rays=64, turns=2, seeds=6)
     assert study.passed == (aim < 1.15)
+
+
+def test_costs_of_own_scenes_are_those_of_equal_error(monkeypatch):
+    """Half the deviation, for half of the rays and twice the time, is worth an eighth and a half of them."""
+
+    def picture(deviation: float, seed: int) -> np.ndarray:
+        return np.random.default_rng(seed).normal(1, deviation, (72, 96, 3))
+
+    def uniform(scene: Any, spp: int, seed: int) -> np.ndarray:
+        return picture(0.1, seed)
+
+    def ours(scene: Any, options: Any, seed: int) -> Any:
+        image = picture(0.05, seed + 10**6) if "target" in options else uniform(scene, 128, seed)
+        return SimpleNamespace(image=image, rounds=[SimpleNamespace(spp=64.0)])
+
+    def timed_in_turns(sides: Any, turns: int) -> Any:
+        seconds = (2.0, 1.0)
+        return [
+            ([side(k) for k in range(turns)], np.full(turns, s))
+            for side, s in zip(sides, seconds, strict=True)
+        ]
+
+    monkeypatch.setattr(adaptive, "uniform", uniform)
+    monkeypatch.setattr(adaptive, "adaptive", ours)
+    monkeypatch.setattr(adaptive, "timed_in_turns", timed_in_turns)
+    monkeypatch.setattr(adaptive, "compare", lambda a, b: mrt.compare(getattr(a, "image", a), b))
+    row = adaptive.own_scene("spot", (96, 72), turns=5)
+    assert row["off by"] == 0
+    assert row["as it is"] == 2
+    assert_allclose([row[name] for name in ("rays", "time", "from", "to")], [1 / 8, *3 * [0.5]], rtol=0.05)
 
 
 @pytest.mark.parametrize("spp", [16, 40, 100])

@@ -136,6 +136,11 @@ def to_the_other_side(wo):
     return wo * mi.Vector3f(1, 1, -1)
 
 
+def rarely_negative(bs, weight, u, ctx):
+    bs.pdf = dr.select((u.x > 0.6) & (u.x < 0.6 + 1e-5), -bs.pdf, bs.pdf)
+    return bs, weight
+
+
 def called_glossy(kind):
     return kind - DELTA + GLOSSY
 
@@ -174,6 +179,7 @@ OF_SAMPLES = {
     "directions not of length 1": Mistake(
         "sample", member("wo", too_long), {"finite.samples", "finite.million"}, MIRROR
     ),
+    "density that is rarely negative": Mistake("sample", rarely_negative, {"finite.million"}),
     "mirror turned": Mistake("sample", member("wo", turned), {"reciprocity.returns"}, MIRROR),
     "mirror to the other side": Mistake(
         "sample",

@@ -26,3 +26,10 @@ def test_one_error_of_many_that_is_no_number_or_too_large_breaks_the_law(place, 
     law.hold("density", errors)
     assert not law.holds
     assert law.worst.measured == pytest.approx(wrong, nan_ok=True)
+
+
+def test_a_law_that_measured_nothing_does_not_hold():
+    law = weights()
+    assert not law.holds
+    law.skipped = "it makes no sense here"
+    assert law.holds

@@ -70,6 +70,7 @@ def test_colour_does_not_depend_on_the_distance(variant):
     ds, _ = it.sample_direction(one, mi.Point2f(0.5))
     assert_array_equal(np.ravel(ds.p), POSITION)
     assert_allclose(spectrum(it.eval_direction(one, ds)), stock_spectrum(2.0), rtol=1e-6)
+    assert (spectrum(it.eval_direction(one, ds, False)) == 0).all()
     assert np.array(it.pdf_direction(one, ds)) == 0
     assert (spectrum(it.eval(one)) == 0).all()
     assert mi.has_flag(it.flags(), mi.EmitterFlags.DeltaPosition)

@@ -74,3 +74,37 @@ def test_however_groups_are_cut_each_ray_is_traced_once(most):
         done += some.count
         traced.append(np.stack([np.array(lane) for lane in some.lanes()]))
     assert_array_equal(np.concatenate(traced, 1), [pixels, numbers])
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("kind", ["mrt_sequence", "independent"])
+@pytest.mark.parametrize("draw", ["next_1d", "next_2d"])
+def test_a_lane_that_is_switched_off_draws_its_number_later(kind, draw):
+    """As of Mitsuba's own samplers: what a branch draws for some rays changes nothing for the others."""
+    sampler = mi.load_dict({"type": kind})
+    some = np.arange(64) % 3 == 0
+
+    def draws(active: mi.Bool) -> list[np.ndarray]:
+        if kind == "mrt_sequence":
+            sampler.start(dr.arange(mi.UInt32, 64), mi.UInt32(7))
+        else:
+            sampler.seed(7, 64)
+        return [np.array(getattr(sampler, draw)(mask)) for mask in (active, True)]
+
+    first, second = draws(mi.Bool(True))
+    _, later = draws(mi.Bool(some))
+    assert (first != second).all()
+    assert_array_equal(later, np.where(some, second, first))
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("number", [0, 1, 2, 5])
+def test_coordinates_of_a_place_do_not_go_together(number):
+    """Of the same ray in many pixels: their correlation is 0, within five deviations of 1/128."""
+    sampler = mi.load_dict({"type": "mrt_sequence"})
+    pixels = 2**14
+    sampler.start_in(3, dr.arange(mi.UInt32, pixels), dr.full(mi.UInt32, number, pixels))
+    x, y = np.array(sampler.next_2d())
+    assert abs(np.corrcoef(x, y)[0, 1]) < 0.04
+    for values in (x, y):
+        assert values.mean() == pytest.approx(0.5, abs=0.02)

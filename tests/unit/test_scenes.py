@@ -7,8 +7,10 @@ import re
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.scene.model import Camera, Material, Scene, Sphere
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
@@ -68,3 +70,15 @@ def test_scene_of_an_obj_file(tmp_path, scale):
     assert 0.1 < hit.mean() < 0.6
     assert not (hit[0].any() or hit[-1].any() or hit[:, 0].any() or hit[:, -1].any())
     assert result.image[hit].mean() > 0.1
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1, 1e5])
+@pytest.mark.parametrize("integrator", ["mrt_whitted", "path"])
+def test_a_scene_of_any_size_is_seen_whole(scale, integrator):
+    """Neither clipped in front nor at the back: a black ball under a sky."""
+    black = Material(1.5, 0.1, (0, 0, 0), (0, 0, 0))
+    ball = Sphere((0, 0, 0), scale, black)
+    scene = Scene(Camera((0, 0, 5 * scale), (0, 0, 0)), (0.25, 0.5, 1), (), spheres=(ball,))
+    image = mrt.render(scene, width=16, height=12, aa=1, aamode="none", integrator=integrator).image
+    assert_array_equal(image[5:7, 7:9], 0)
+    assert_allclose(image[[0, -1]], np.broadcast_to([0.25, 0.5, 1], (2, 16, 3)), rtol=1e-6)
