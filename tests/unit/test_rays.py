@@ -95,16 +95,3 @@ def test_a_lane_that_is_switched_off_draws_its_number_later(kind, draw):
     _, later = draws(mi.Bool(some))
     assert (first != second).all()
     assert_array_equal(later, np.where(some, second, first))
-
-
-@pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("number", [0, 1, 2, 5])
-def test_coordinates_of_a_place_do_not_go_together(number):
-    """Of the same ray in many pixels: their correlation is 0, within five deviations of 1/128."""
-    sampler = mi.load_dict({"type": "mrt_sequence"})
-    pixels = 2**14
-    sampler.start_in(3, dr.arange(mi.UInt32, pixels), dr.full(mi.UInt32, number, pixels))
-    x, y = np.array(sampler.next_2d())
-    assert abs(np.corrcoef(x, y)[0, 1]) < 0.04
-    for values in (x, y):
-        assert values.mean() == pytest.approx(0.5, abs=0.02)
