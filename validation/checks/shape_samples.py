@@ -171,7 +171,7 @@ def too_short(size, ds, it, u):
 @finds(
     "angle",
     "density of directions too small",
-    0.03,
+    0.1,
     quick=0.2,
     pdf_direction=smaller,
     sample_direction=member("pdf", smaller),
