@@ -10,7 +10,7 @@ import pytest
 from cases import Cases
 
 from mrt_mitsuba import filters
-from mrt_mitsuba.plugins import fresnel, lobes, microfacet, scene_data
+from mrt_mitsuba.plugins import fresnel, hit_errors, lobes, microfacet
 from mrt_mitsuba.validation.studies import stability
 from mrt_mitsuba.validation.tools.study import findings
 
@@ -87,7 +87,7 @@ by_itself = (microfacet, "beckmann_d", steep_gradient)
 in_lobes = (lobes, "beckmann_d", steep_gradient)
 loss("gradient", "bsdf", by_itself, in_lobes, missed=["gradient in alpha, p99.9"])
 shadows = ["spheres, shadow rays", "cones, shadow rays"]
-loss("offset", "geometry", (scene_data, "CURVED", 0.0), missed=shadows)
+loss("offset", "geometry", (hit_errors, "CURVED", 0.0), missed=shadows)
 damaged = [f"nan or inf in a picture, blur ({variant}_rgb)" for variant in ("llvm_ad", "scalar")]
 loss("damage", "filters", (filters, "gaussian_dof", spreading), missed=damaged)
 behind = (lobes, "COS_MIN", 1e-13)
