@@ -41,7 +41,7 @@ def divide(n: mi.UInt32, divisor: int) -> tuple[mi.UInt32, mi.UInt32]:
     if mi.variant().startswith("scalar"):
         return divmod(n, divisor)
     quotient = mi.UInt32((mi.Float64(n) + 0.5) * opaque(1 / divisor, "Float64"))
-    return quotient, n - quotient * opaque(divisor)
+    return quotient, n - quotient * opaque(divisor, "UInt32")
 
 
 @lru_cache(maxsize=64)

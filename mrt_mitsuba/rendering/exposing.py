@@ -323,7 +323,8 @@ class Exposer:
                 if chosen is not None:
                     means = (known * layer[rows] + new * means) / np.float32(known + new)
                 layer[rows] = means
-            del values, sums, means  # they would take room next to those of the next wavefront
+                del sums, means
+            del values  # which would take room, as these would, next to the next wavefront
             advance(part.stop - part.start)
         workspace = self.job.workspace
         most = max(workspace.rays_at_once(channels), groups.size)

@@ -462,19 +462,16 @@ class RayNoise:
         near = None if alone else np.stack([_nearby(state.differing * ~f, WINDOWS[2:]) for f in self._fields])
         # of a ray's variance in the squares of the halves' difference
         weight = np.float32((1 / state.rays[HALVES]).sum(0) / (4 * state.unit))
-        found, expected = state.differing
+        own = [] if alone else [_own_errors(state, index) for index in HALVES]
         chosen = np.zeros((4, self.film.pixels), np.int64)
         for index in HALVES:
             have = state.rays[index]
             views = self._variance_of_rays(state, state.sums(1 - index), scouts, near)
-            # squared errors by the half's own rays, which the other half has not met, unlike their difference
-            own = state.sums(index).variance * (weight * np.float32(state.unit))
-            own *= np.divide(found, expected, out=np.zeros_like(own), where=expected > 0)
             for field, variance in zip(self._fields, views.reshape(-1, *self.film.shape), strict=True):
                 gain = 0.0
                 if near is not None:
-                    errors = _levelled(variance * weight, own, ~field)
-                    drawn = _drawn(errors[~field], found[~field])
+                    errors = _levelled(variance * weight, own[index], ~field)
+                    drawn = _drawn(errors[~field], state.differing[0][~field])
                     variance = errors * drawn / weight
                     gain = self._gain(state, ~field)
                 deviation = _smoothed(variance)
@@ -635,6 +632,14 @@ def _calibrated(variance: np.ndarray, squares: np.ndarray) -> np.ndarray:
     ratio = np.maximum(measured / np.maximum(stated, 1e-300), LEAST_RATIO)
     drawn = ratio ** (number / (number + STATED))
     return np.asarray(variance * drawn[tenth])
+
+
+def _own_errors(state: State, index: int) -> np.ndarray:
+    """Squared errors of a half by its own rays, [H, W], which the other half has not met, unlike what their
+    difference holds; less what a sequence gains by that difference."""
+    found, expected = state.differing
+    own = state.sums(index).variance * np.float32((1 / state.rays[HALVES]).sum(0) / 4)
+    return own * np.divide(found, expected, out=np.zeros_like(own), where=expected > 0)
 
 
 def _levelled(stated: np.ndarray, measured: np.ndarray, among: np.ndarray) -> np.ndarray:
