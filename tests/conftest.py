@@ -24,6 +24,9 @@ settings.register_profile("short", max_examples=200, deadline=None, derandomize=
 settings.register_profile("long", max_examples=10_000, deadline=None, database=None)
 settings.load_profile("short")
 
+# A shell has Ctrl-C ignored in what it runs in the background, and so would all that tests start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 @pytest.fixture
 def run_command(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
@@ -81,15 +84,13 @@ def mrt_command(run_command: Callable[..., Any]) -> Callable[..., subprocess.Com
 def start(tmp_path: Path) -> Callable[..., contextlib.AbstractContextManager[subprocess.Popen[str]]]:
     """Start a command in the test's folder: ``with start(*words) as process``; it ends with the block.
 
-    It heeds Ctrl-C, which a shell has ignored in what it runs in the background, and is killed after five
-    minutes.
+    It is killed after five minutes.
     """
 
     @contextlib.contextmanager
     def started(*words: object, **options: Any) -> Iterator[subprocess.Popen[str]]:
         pipes = {name: subprocess.PIPE for name in ("stdout", "stderr")}
-        heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-        with subprocess.Popen(words, cwd=tmp_path, text=True, preexec_fn=heed, **pipes | options) as process:
+        with subprocess.Popen(words, cwd=tmp_path, text=True, **pipes | options) as process:
             limit = threading.Timer(300, process.kill)
             limit.start()
             try:
