@@ -203,3 +203,16 @@ def test_rays_that_are_switched_off_see_nothing():
     )
     assert np.array(spectrum)[0].tolist() == [1, 0]
     assert dr.none(valid)
+
+
+def test_rays_after_a_render_see_the_scene_that_they_are_given():
+    """``render`` reads its scene once for all of its rays; ``sample`` by itself must not go on with that."""
+    integrator = mi.load_dict(WHITTED)
+    view = sensor([0, 0, 5], [0, 0, 0], (4, 3))
+    for light in (0.25, 0.5):
+        sky = {"type": "constant", "radiance": light}
+        scene = mi.load_dict({"type": "scene", "sensor": view, "sky": sky})
+        ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1))
+        seen, _, _ = integrator.sample(scene, mi.load_dict({"type": "independent"}), ray)
+        assert_allclose(np.array(seen), light, rtol=1e-6)
+        mi.render(scene, integrator=integrator, spp=1)

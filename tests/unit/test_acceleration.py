@@ -84,3 +84,18 @@ def test_lists_around_the_eye_find_what_a_search_finds(kind, size):
             listed, seen = lists.nearest(ray, mi.Bool(True), lambda *_: (mi.Float(0),), (ray.maxt,))
             assert np.mean(seen) == at_eye
             assert np.mean(np.array(listed[0]) == 0) >= 0.02 * at_eye  # where something is listed
+
+
+def test_trees_find_hairs_far_from_the_origin():
+    """Hairs along an axis, thinner than the steps of coordinates there; their own test meets nearly all."""
+    rng = np.random.default_rng(5)
+    starts = np.float32(rng.uniform(299, 301, (64, 3)))
+    ends = starts + np.float32([0, 0, 1])
+    hairs = group(np.column_stack([starts, ends, np.full(64, 1e-5)]), kind="cylinder")
+    things = Quadrics([mi.load_dict(hairs)])
+    origins = np.float32(starts + rng.normal(size=(64, 3)))
+    d = starts + np.array([0, 0, 0.5]) - origins  # to their middles
+    ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(d.T), 2, 0, [])
+    alone = np.array(things.block(mi.UInt32(things.leaf_of), ray))
+    assert alone.mean() > 0.9
+    assert_array_equal(np.array(things.occluded(ray, mi.Bool(True))), alone)

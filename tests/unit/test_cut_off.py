@@ -63,6 +63,8 @@ def picture(scene: mi.Scene, **options: Any) -> np.ndarray:
 cut = Cases()
 cut(balls(), {}, name="plain")
 cut(balls(sky={"type": "constant", "radiance": 1000.0}), {}, name="sky 1000")
+GREY = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32)), "scale": 1000.0}
+cut(balls(sky=GREY), {}, name="map 1000")
 cut(balls(), {"sky": 1000.0}, name="own sky")
 cut(balls(light=LIGHT | {"intensity": 1e4}), {"clamp": False}, name="unclamped")
 cut(balls(light=LIGHT | {"type": "point", "intensity": 1e5}), {"clamp": False}, name="with falloff")
@@ -99,5 +101,6 @@ def test_the_brightest_lamp_bounds_what_a_path_may_still_bring():
 def test_facing_planes_of_any_reflectance_give_numbers():
     """A throughput that leaves float32, times no light, is no light."""
     planes = mirrors(7.0, specular_reflectance=1e5)
-    assert (picture(loaded(planes), max_depth=40) == 0).all()
+    behind = LIGHT | {"position": [9, 4, 5]}
+    assert (picture(loaded(planes | {"light": behind}), max_depth=40) == 0).all()
     assert not np.isnan(picture(loaded(planes | {"light": LIGHT}), max_depth=40)).any()

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cases import Cases
-from nodes import rgb, sensor
+from nodes import group, rgb, sensor
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -119,6 +119,10 @@ for case in (
     *exact_shape("mrt_cylinder", "p0", "p1", 1.0),
 ):
     slopes(*case)
+# Next to quadrics that stand before it in the tables, and behind the camera
+GROUP = group([[x, 1, 9, x, 0, 9, 0.1] for x in range(3)], kind="cone")
+CONE = {"type": "mrt_cone", "apex": [0, 4, 0], "base_center": [0, -4, 0], "radius": 2.0, "segments": 8}
+slopes("cone.radius", 1e-2, {"ball": GROUP, "cone": {**CONE, "bsdf": MATERIAL}})
 # More lights than a kernel has code of their own for, without derivatives
 MANY = {f"light{i}": {"type": "mrt_light", "position": [i, 2, 5], "intensity": 0.05} for i in range(8)}
 slopes("light3.intensity.value", 2e-2, MANY)

@@ -157,6 +157,8 @@ reason("lobes", "no material has the specular one", a=MATTE_BALL)
 unbounded = "what may still arrive has no known bound"
 reason("cut_off", unbounded, a=SPHERE, b=CONE, lamp=LAMP, integrator=UNCLAMPED)
 reason("two_sided", "no material is lit from behind", a=SPHERE)
+INSTANCE = {"type": "instance", "of": {"type": "ref", "id": "inside"}}
+reason("merged", "instances in the scene", a=SPHERE, inside={"type": "shapegroup", "b": MESH}, c=INSTANCE)
 reason("merged", "a material other than mrt_bsdf", a={"type": "sphere"})
 reason("merged", "materials of different Fresnel formulas", a=SPHERE, b=EXACT_CONE)
 reason("merged", "a material varies over its surface", a=GROUP)

@@ -8,8 +8,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
-from nodes import scene_xml
+from nodes import scene_xml, sensor
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
@@ -82,10 +83,16 @@ def changes(parameters: Any) -> None:
     parameters.update({"radiance.value": 3.0})
 
 
-@pytest.mark.parametrize("act", [change, changes])
-def test_a_change_waits_for_a_render_in_another_thread(act):
+def render(parameters: Any) -> None:
+    scene = mi.load_dict({"type": "scene", "sensor": sensor([0, 0, 1], [0, 0, 0], (4, 3))})
+    np.array(mi.render(scene, parameters, 0, mi.load_dict({"type": "mrt_whitted"}), spp=1))
+
+
+@pytest.mark.parametrize("act", [change, changes, render])
+def test_changes_and_renders_wait_for_a_render_in_another_thread(act):
     """Dr.Jit ends the process where both happen at once."""
     parameters = mi.traverse(mi.load_dict({"type": "constant", "radiance": 1.0}))
+    act(parameters)  # its kernels are there afterwards
     done = threading.Event()
     thread = threading.Thread(target=lambda: (act(parameters), done.set()))
     with runtime.one_at_a_time.lock:

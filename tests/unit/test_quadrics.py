@@ -64,7 +64,8 @@ rays("cylinder", (1 - 1e-12, 0, 5), (0, 0, -1), 4, TOP)  # parallel to the side,
 rays("cylinder", (1 + 1e-12, 0, 5), (0, 0, -1), INF, None)
 rays("cylinder", (0.2, 0, 0.5), (0, 0, 1), 0.5, TOP)
 rays("cylinder", (3, 1 + 1e-12, 0.5), (-1, 0, 0), INF, None)
-rays("cylinder", (3, 0, 1 + 1e-12), (-1, 0, 0), INF, None)
+rays("cylinder", (3, 0, 1 + 1e-12), (-1, 0, 0), INF, None)  # level, just above
+rays("cylinder", (3, 0, -1e-12), (-1, 0, 0), INF, None)  # ... and below
 rays("cylinder", (2, 0, -1), (-1, 0, 1), 1, LATERAL)  # onto the rim
 rays("open cylinder", (0.2, 0, -5), (0, 0, 1), INF, None)
 
