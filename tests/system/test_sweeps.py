@@ -604,11 +604,12 @@ if api.render.__module__ == api.__name__:  # it is read more than once
 
 
 def test_tiles_of_an_earlier_sweep_are_kept(mortal, tmp_path):
-    """Those that are whole: of two that are there, one was cut in the meantime."""
+    """Those that are whole, unless asked otherwise: of two that are there, one was cut in the meantime."""
     address = mortal(BROKEN).address
     out = tmp_path / "out"
     first = mrt.sweep(3, out, tiles=(2, 2), retries=0, cluster=address, **SMALL)
     assert "out of luck" in first.failed[0]["error"]
+    mrt.sweep(3, out, tiles=(2, 2), retries=0, resume=False, cluster=address, **SMALL)
     tile, cut = (out / "picture.tiles" / f"0,{column}.exr" for column in (0, 1))
     assert tile.exists()
     cut.write_bytes(cut.read_bytes()[:9000])
@@ -617,6 +618,6 @@ def test_tiles_of_an_earlier_sweep_are_kept(mortal, tmp_path):
     assert not second.failed
     assert second.rows[0]["rays"] is None  # unknown of the tile that was there
     rendered = (tmp_path / "cluster0" / "rendered").read_text().splitlines()
-    assert sorted(map(rendered.count, rendered)) == [1, 1, 1, 2, 2]
+    assert sorted(map(rendered.count, rendered)) == [1, 1, 2, 2, 3, 3, 3]
     assert read_exr(out / "picture.exr").image.tobytes() == mrt.render(3, **SMALL).image.tobytes()
     assert not (out / "picture.tiles").exists()

@@ -131,6 +131,12 @@ def test_a_lobe_at_the_least_roughness(bsdf):
     holds(mrt.check_bsdf(bsdf, only=["weights"]))  # at 89 degrees, where a lobe is 60 times as narrow
 
 
+def test_no_energy_is_gained_where_light_grazes_a_rarer_medium_and_passes():
+    """It would be in the mode of radiance, which transmission scales by the squared index."""
+    glass = {"type": "dielectric", "int_ior": 1.3, "ext_ior": 1.307}  # reflects all from 84 degrees on
+    holds(mrt.check_bsdf(glass, quick=True, only=["energy"]))
+
+
 def test_a_texture_that_loading_uses_up():
     bumps = mi.TensorXf(np.random.default_rng(0).random((8, 8, 1)).astype(np.float32))
     bumpy = {"type": "bumpmap", "texture": {"type": "bitmap", "raw": True, "data": bumps}, "scale": 0.02}

@@ -251,9 +251,25 @@ def test_rays_are_doubled_twice_where_few_of_them_rule(tail, times):
         assert result.rounds[-1].spp == pytest.approx(256 * times, rel=0.15)
 
 
+def test_no_more_rays_than_allowed_are_spent_where_scouts_met_less_noise():
+    """They take the target for reached, and the halves would take four times the rays."""
+    exposer = Draws(_calm)
+    exposer.draws[2:] = 2 * [lambda rng, pixel: 1 + 0.1 * (_calm(rng, pixel) - 1)]
+    with pytest.warns(mrt.MrtWarning, match="maxspp=35 ends the render"):
+        assert _render(exposer, target=0.05, rays=35).rounds[-1].spp <= 35
+
+
 def test_a_tail_of_values_that_are_alike_has_a_shape():
     values = np.repeat([0.0, 2.0], [39204, 99])  # one of the shapes tried is that of an exponential law
     assert np.isfinite(tail_shape(values, np.ones_like(values)))
+
+
+@pytest.mark.parametrize(("bright", "doubtful"), [(20, True), (30, False)])
+def test_what_many_values_rule_is_no_matter_of_doubt(bright, doubtful):
+    """Of two kinds of pixels, the brighter ones have half of the squares: by their shape, a heavy tail."""
+    near = np.linspace(1, 1.1, 30 * bright)
+    values = np.concatenate([100 * near[:bright], 16 * near])
+    assert (tail_shape(values, np.ones_like(values)) > DOUBTFUL) == doubtful
 
 
 @pytest.mark.parametrize(("draw", "doubtful"), [(_calm, False), (_rare(0.3), False), (_rare(0.003, 8), True)])
@@ -298,10 +314,15 @@ def test_pixels_state_what_neighbours_met_and_what_halves_differ_by():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_radiance_that_is_no_number_is_named_and_left_out(value):
-    def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
-        return np.where(pixel == 3 * SIDE + 5, value, _calm(rng, pixel))
+    """Also in a pixel where it was met once, before others met it."""
+    done = list[bool]()
 
-    with pytest.warns(mrt.MrtWarning, match=f"radiance of {value} .* 1 pixel.* row 3, column 5") as warned:
+    def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
+        unfit = 9 * SIDE + 2 if done else 3 * SIDE + 5
+        done.append(True)
+        return np.where(pixel == unfit, value, _calm(rng, pixel))
+
+    with pytest.warns(mrt.MrtWarning, match=f"radiance of {value} .* 2 pixels.* row 3, column 5") as warned:
         result = _render(Draws(draw), target=0.05, rays=4000)
     assert len(warned) == 1
     assert result.error.rmse < 0.055

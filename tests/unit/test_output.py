@@ -75,7 +75,9 @@ def test_exr_holds_every_bit(tmp_path, image):
     layers = {"depth.Z": image[:, :, 0], "normal": image, "albedo": image * 2, "samples": image[:, :, 1]}
     header = {"mrt:alpha": 1.5, "mrt:options": {"aa": 4, "layers": ["depth"]}}
     output.write_exr(tmp_path / "a.exr", image, layers, header)
+    before = os.listdir("/proc/self/fd")
     back = output.read_exr(tmp_path / "a.exr")
+    assert len(os.listdir("/proc/self/fd")) == len(before)  # no file stays open
     assert_array_equal(back.image, image)
     assert back.image.dtype == np.float32
     expected = {"depth.Z": image[:, :, 0], "samples.Y": image[:, :, 1]}

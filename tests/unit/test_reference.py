@@ -149,3 +149,9 @@ def test_no_light_is_negative_and_each_is_seen_by_itself():
     one = reference_render(scene(ball, lights=lights), **ONE_PIXEL)
     other = reference_render(scene(ball, lights=lights[::-1]), **ONE_PIXEL)
     assert one.lights != other.lights
+    lid = Sphere((3, 2.5, 0), 0.5, WOOD)  # hides the higher of two lights before the ball
+    high, low, back = (Light(place, (1, 1, 1)) for place in ((5, 5, 0), (5, 1, 0), (-5, 1, 0)))
+    pairs = (high, back), (back, high), (low, back), (back, low), (high, low), (low, high)
+    seen = [reference_render(scene(ball, lid, lights=pair), **ONE_PIXEL) for pair in pairs]
+    assert len({int(each.lights[0, 0]) for each in seen}) == len(pairs)
+    assert len({int(each.path[0, 0]) for each in seen}) == 1
