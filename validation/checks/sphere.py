@@ -85,6 +85,9 @@ class Cells(Lanes):
 
     def find(self, codes: Array) -> Array:
         """Index of the cell in which each direction lies."""
+        level = self.level[0]
+        if len(self.start) == 2 * 4**level:  # all cells of one level, which are found without a search
+            return codes // 4 ** (DEPTH - level)
         return np.searchsorted(self.start, codes, side="right") - 1
 
     def quartered(self) -> Cells:
