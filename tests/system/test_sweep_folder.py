@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from clusters import PATIENCE, Cluster
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, OutputError
@@ -20,7 +21,6 @@ pytest.importorskip("distributed")
 pytestmark = pytest.mark.attack
 
 SMALL = {"width": 64, "height": 48, "aa": 1}
-PATIENCE = 120  # seconds for anything that processes do; a busy machine is no failure
 COMMAND = [sys.executable, "-m", "mrt_mitsuba.command.main"]
 SWEEP = "scene = 3\nwidth = 64\nheight = 48\naa = 1\n[grid]\nseed = [{}]\n"
 
@@ -34,6 +34,14 @@ def render(*scene, seed=0, alone=api.render, **options):
     return alone(*scene, seed=seed, **options)
 api.render = render
 """
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """The address of a cluster with one worker, for tests that leave it whole."""
+    cluster = Cluster(tmp_path_factory.mktemp("cluster"), count=1)
+    yield cluster.address
+    cluster.stop()
 
 
 class Meanwhile(Progress):
@@ -60,7 +68,7 @@ def hidden(folder):
 
 
 @pytest.mark.parametrize("name", ["out", "link", "out/../out"])
-def test_a_second_sweep_in_the_folder_is_refused(tmp_path, name):
+def test_a_second_sweep_in_the_folder_is_refused(address, tmp_path, name):
     """In the same process and in another, by whatever path; the first one is not disturbed."""
     out = tmp_path / "out"
     out.mkdir()
@@ -75,7 +83,7 @@ def test_a_second_sweep_in_the_folder_is_refused(tmp_path, name):
         mrt.sweep(3, tmp_path / name, grid={"seed": [7, 8]}, **SMALL)
 
     meanwhile = Meanwhile(begin_another)
-    table = mrt.sweep(3, out, grid={"seed": [1]}, workers=1, progress=meanwhile, **SMALL)
+    table = mrt.sweep(3, out, grid={"seed": [1]}, cluster=address, progress=meanwhile, **SMALL)
     assert not table.failed
     assert len(meanwhile.errors) == 1
     assert "another sweep works there" in meanwhile.errors[0]
@@ -114,14 +122,14 @@ def test_a_lock_file_that_a_killed_sweep_left_does_not_matter(tmp_path):
     assert hidden(tmp_path) == [".mrt-sweep-of-the-user"]
 
 
-def test_without_locks_or_room_the_reason_is_said(tmp_path, monkeypatch):
+def test_without_locks_or_room_the_reason_is_said(address, tmp_path, monkeypatch):
     def unsupported(file, operation):
         raise OSError(95, "Operation not supported")
 
     with monkeypatch.context() as patch:
         patch.setattr(fcntl, "flock", unsupported)
         with pytest.warns(MrtWarning, match="has no locks") as warned:
-            assert not mrt.sweep(3, tmp_path, workers=1, **SMALL).failed
+            assert not mrt.sweep(3, tmp_path, cluster=address, **SMALL).failed
         assert warned[0].filename == __file__
     assert hidden(tmp_path) == []
     with pytest.raises(OutputError, match=r"cannot (write to|make) the folder /proc"):
@@ -145,9 +153,9 @@ def drop(data, place):
 
 
 @pytest.mark.parametrize("damage", [flip, blank, cut, drop])
-def test_damaged_pictures_are_made_again(tmp_path, damage, capfd):
+def test_damaged_pictures_are_made_again(address, tmp_path, damage, capfd):
     """Anywhere in the file: the header, the mark of the sweep in it, the table of rows, pixels, the end."""
-    options = {"grid": {"seed": range(5)}, "png": True, "workers": 1, **SMALL}
+    options = {"grid": {"seed": range(5)}, "png": True, "cluster": address, **SMALL}
     mrt.sweep(3, tmp_path, **options)
     whole = contents(tmp_path)
     names = sorted(whole)
@@ -165,9 +173,9 @@ def test_damaged_pictures_are_made_again(tmp_path, damage, capfd):
     assert capfd.readouterr() == ("", "")  # nothing of what libraries print about broken files
 
 
-def test_damaged_tiles_are_made_again(tmp_path):
+def test_damaged_tiles_are_made_again(address, tmp_path):
     """A folder stands where the picture should be written, so that its tiles stay."""
-    options = {"tiles": (2, 2), "workers": 1, "retries": 0, **SMALL}
+    options = {"tiles": (2, 2), "cluster": address, "retries": 0, **SMALL}
     (tmp_path / "picture.exr").mkdir()
     with pytest.raises(OutputError, match="was not made by a sweep"):
         mrt.sweep(3, tmp_path, **options)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import itertools
-import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +18,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from cases import Cases
+from clusters import PATIENCE, Cluster, wait_for
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
@@ -35,64 +34,6 @@ pytestmark = pytest.mark.attack
 SMALL = {"width": 64, "height": 48, "aa": 1}
 ROUNDS = int(os.environ.get("MRT_ATTACK_ROUNDS", "1"))
 NOWHERE = "tcp://127.0.0.1:9"  # no scheduler is there
-PATIENCE = 120  # seconds for anything that processes do; a busy machine is no failure
-
-
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    """Return what a condition gives as soon as it is true."""
-    deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline:
-        found = condition()
-        if found:
-            return found
-        time.sleep(0.02)
-    raise AssertionError(f"waited in vain for {what}")
-
-
-class Cluster:
-    """A scheduler and two workers, started by hand; ``preload``: Python code that each worker runs first."""
-
-    def __init__(self, folder: Path, preload: str = "", *words: str) -> None:
-        self.folder = folder
-        self.words = words
-        self.workers = []
-        (folder / "preload.py").write_text(preload)
-        self.start_scheduler()
-        self.start_workers()
-
-    def start_scheduler(self, port: str = "0") -> None:
-        file = self.folder / "scheduler.json"
-        file.unlink(missing_ok=True)
-        self.scheduler = self._start("scheduler", "--port", port)
-
-        def ready() -> bool:
-            if self.scheduler.poll() is not None:  # its port was taken, for a moment
-                self.scheduler = self._start("scheduler", "--port", port)
-            return file.exists() and file.read_text().endswith("}")
-
-        wait_for(ready, "a scheduler")
-        self.address = json.loads(file.read_text())["address"]
-
-    def start_workers(self) -> None:
-        own = ["--nthreads", "1", "--local-directory", str(self.folder), "--preload", "preload.py"]
-        self.workers += [self._start("worker", *own, *self.words) for _ in range(2)]
-        with Client(self.address, timeout=PATIENCE, set_as_default=False) as client:
-            client.wait_for_workers(2, timeout=PATIENCE)
-
-    def _start(self, *words: str) -> subprocess.Popen[bytes]:
-        environ = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
-        common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", "scheduler.json"]
-        with open(self.folder / "log", "ab") as log:
-            options: dict[str, Any] = {"env": environ, "stdout": log, "stderr": log}
-            command = [sys.executable, "-m", "dask", *words, *common]
-            return subprocess.Popen(command, cwd=self.folder, start_new_session=True, **options)
-
-    def stop(self) -> None:
-        """End all processes, also those that the workers have started."""
-        for process in (*self.workers, self.scheduler):
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
 
 
 @pytest.fixture(scope="module")
@@ -108,10 +49,10 @@ def mortal(tmp_path: Path) -> Iterator[Callable[..., Cluster]]:
     """Starts clusters for tests that break them."""
     started: list[Cluster] = []
 
-    def start(*words: str) -> Cluster:
+    def start(*words: str, count: int = 2) -> Cluster:
         folder = tmp_path / f"cluster{len(started)}"
         folder.mkdir()
-        started.append(Cluster(folder, *words))
+        started.append(Cluster(folder, *words, count=count))
         return started[-1]
 
     yield start
@@ -138,11 +79,12 @@ def test_pictures_are_those_of_render_alone(address, tmp_path):
     """All combinations of options, seeds and scenes: a number, a dict with Mitsuba's types, a file; of two
     workers each takes half of the machine's cores."""
     mrt.register()
-    scenes = [3, mrt.scene_dict(8, width=64, height=48), str(tmp_path / "mine.xml")]
+    scenes = [3, mrt.scene_dict(8), str(tmp_path / "mine.xml")]
     assert cli.main(["export", "1", "--xml", scenes[2]]) == 0
+    small = {"width": 64, "height": 48, "layers": ["depth"]}
     grid = {"scene": scenes, "aa": [1, 2], "seed": np.arange(2)}
     with Client(address, set_as_default=False) as client:
-        table = mrt.sweep(None, tmp_path / "out", grid=grid, cluster=client, layers=["depth"])
+        table = mrt.sweep(None, tmp_path / "out", grid=grid, cluster=client, **small)
         threads = client.run(lambda: dr.thread_count())
     half = max(1, usable_cores() // 2)
     assert {threads[row["worker"]] for row in table.rows} == {half}
@@ -150,7 +92,7 @@ def test_pictures_are_those_of_render_alone(address, tmp_path):
     assert not table.failed
     assert not left_over(tmp_path / "out")
     for row in table.rows:
-        alone = mrt.render(row["scene"], aa=row["aa"], seed=row["seed"], layers=["depth"])
+        alone = mrt.render(row["scene"], aa=row["aa"], seed=row["seed"], **small)
         found = read_exr(tmp_path / "out" / row["file"])
         assert found.image.tobytes() == alone.image.tobytes()
         assert found.layers.keys() == alone.layers.keys()
@@ -305,7 +247,7 @@ def test_a_scene_file_counts_by_its_contents(address, mortal, tmp_path):
     namesake = tmp_path / "other" / "mine.xml"
     with pytest.raises(UsageError, match="2 jobs would write the same file scene=mine"):
         mrt.sweep(None, out, grid={"scene": [str(scene), str(namesake)]}, **options)
-    changing = mortal(CHANGES)
+    changing = mortal(CHANGES, count=1)
     (row,) = mrt.sweep(scene, tmp_path / "late", cluster=changing.address, **SMALL).failed
     assert "mine.xml has changed since the sweep began" in row["error"]
 
@@ -411,7 +353,7 @@ def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path):
     out = tmp_path / "out"
     cluster = mortal(SPOILED, "--memory-limit", "1200MB")
     options = {"cluster": cluster.address, "retries": 1, "progress": Slow(), **SMALL}
-    table = mrt.sweep(3, out, grid={"seed": range(20)}, **options)
+    table = mrt.sweep(3, out, grid={"seed": range(10)}, **options)
     errors = {row["seed"]: row["error"] for row in table.failed}
     assert errors.keys() == {1, 3, 4}
     assert errors[1] == "RuntimeError: out of luck"
@@ -420,9 +362,9 @@ def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path):
     attempts = [row["attempts"] for row in table.rows]
     assert attempts[1] == 2 <= attempts[2]
     assert attempts[5] == 1
-    assert len(made(out)) == 17
+    assert len(made(out)) == 7
     assert not left_over(out)
-    assert str(table).startswith("17 of 20 pictures")
+    assert str(table).startswith("7 of 10 pictures")
     assert all(row["file"] == "" for row in table.failed)
 
 
@@ -436,7 +378,7 @@ def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path):
 )
 def test_workers_with_other_software_are_refused(mortal, tmp_path, preload, message):
     with pytest.raises(MrtError, match=f"(?s){message}.*install") as caught:
-        mrt.sweep(3, tmp_path / "out", cluster=mortal(preload).address, **SMALL)
+        mrt.sweep(3, tmp_path / "out", cluster=mortal(preload, count=1).address, **SMALL)
     assert "\n" not in str(caught.value)
     assert not made(tmp_path / "out")
 
