@@ -19,6 +19,7 @@ import numpy as np
 from nodes import group, mesh, rgb, sensor
 
 import mrt_mitsuba as mrt  # before mitsuba: it chooses the LLVM library
+from mrt_mitsuba.mitsuba_changes import rewriting_later
 
 EDITS = 6  # of each scene
 # Keys that shape the film, that hold an address of memory, or that edits may not take to any value
@@ -204,7 +205,8 @@ def live(content: dict[str, Any], edits: list[Edit]) -> Iterator[np.ndarray]:
             _interrupted(lambda: drawn(scene), int(1 + number * 300))
         if kind == "switch":
             mi.set_variant("scalar_rgb")
-            mi.set_variant("llvm_ad_rgb")
+            with rewriting_later():
+                mi.set_variant("llvm_ad_rgb")
         if kind == "other":  # a scene of the same objects, under the same integrator
             things = [scene.integrator(), *scene.sensors(), *scene.shapes()[:-1]]
             few = [t for t in things if t.class_name() != "Instance" and not getattr(t, "is_emitter", bool)()]

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 def registered(variant):
     """The specimen of a BSDF, in both kinds of variants."""
     for name in (runtime.SLOW, variant):
-        mi.set_variant(name)
+        runtime.use(name)
         specimens.register()
 
 
@@ -39,7 +39,7 @@ def run(snippet):
     try:
         exec(compile(snippet, "snippet", "exec"), {})
     finally:
-        mi.set_variant(before)
+        runtime.use(before)
 
 
 def test_a_sound_bsdf_passes_as_a_dict_and_loaded(registered):

@@ -167,7 +167,7 @@ def settings_restored() -> Iterator[None]:
             yield
     finally:
         if mi.variant() != variant:
-            mi.set_variant(variant)
+            runtime.use(variant)
         for flag, value in flags.items():
             if dr.flag(flag) != value:
                 dr.set_flag(flag, value)

@@ -131,7 +131,7 @@ class Subject:
             fix = "register it there (mi.detail.add_variant_callback)"
             raise Skip(f"{other} does not know the plugin: {fix}") from None
         finally:
-            mi.set_variant(here)
+            runtime.use(here)
 
     @property
     def other_kind(self) -> str:
