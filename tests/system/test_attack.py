@@ -336,8 +336,8 @@ mrt.register()
 import mitsuba as mi
 signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
 mi.set_log_level(mi.LogLevel.Error)
-options = {"width": 160, "height": 120, "aa": 2, "integrator": "path", "spp": 4}
-scene = mi.load_dict(mrt.scene_dict(3, width=320, height=240))
+options = {"width": 80, "height": 60, "aa": 2, "integrator": "path", "spp": 4}
+scene = mi.load_dict(mrt.scene_dict(3, width=160, height=120))
 doors = {"mrt": lambda: mrt.render(3, **options), "mi": lambda: mi.render(scene, spp=4).numpy()}
 render = doors[sys.argv[1]]
 interrupts = {"mrt": KeyboardInterrupt, "mi": (KeyboardInterrupt, RuntimeError)}  # as Dr.Jit has them
