@@ -351,7 +351,7 @@ def test_rounds_report_and_stop():
 def test_limits_of_rays_and_seconds():
     scene = _load("rough_glass")
     with pytest.warns(mrt.MrtWarning, match=r"target=1e-06 is not reached: maxspp=40 ends the render"):
-        assert mrt.render(scene, target=1e-6, maxspp=40).rounds[-1].spp <= 41
+        assert mrt.render(scene, target=1e-6, maxspp=40, maxseconds=3600).rounds[-1].spp <= 41
     with pytest.warns(mrt.MrtWarning, match=r"maxseconds=0 ends the render at an error of 0\.0"):
         assert len(mrt.render(scene, target=1e-6, maxseconds=0).rounds) == 1
     assert mrt.render(scene, spp=4).error is None

@@ -19,12 +19,21 @@ from cases import Cases
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.command import options, registry
 from mrt_mitsuba.command.render import banner
-from mrt_mitsuba.errors import MrtWarning, SceneError
+from mrt_mitsuba.errors import MrtError, MrtWarning, SceneError
 from mrt_mitsuba.rendering import api
 from mrt_mitsuba.rendering.progress import TerminalProgress
 from mrt_mitsuba.validation.tools.compare import Difference
 
 SMALL = ("width=16", "height=12")
+
+
+def test_a_self_test_that_fails_is_a_failure(monkeypatch, capsys):
+    def broken(*scene: object, **options: object) -> None:
+        raise MrtError("no kernel")
+
+    monkeypatch.setattr(api, "render", broken)
+    assert cli.main(["doctor"]) == 1
+    assert "self-test: FAILED: no kernel" in capsys.readouterr().out
 
 
 def test_render_writes_and_says_what_the_report_says(tmp_path, capsys):

@@ -7,6 +7,7 @@ import os
 import pickle
 import resource
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -231,7 +232,7 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path, image):
     left, alive, recent, own = (tmp_path / f".mrt-{name}.tmp" for name in names)
     with alive.open("wb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        for path, made in ((left, 0), (alive, 0), (recent, 2**32), (own, 0)):
+        for path, made in ((left, 0), (alive, 0), (recent, time.time() - 1), (own, 0)):
             path.touch()
             os.utime(path, (made, made))
         output.save(tmp_path / "a.png", image)
