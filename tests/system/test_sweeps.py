@@ -79,8 +79,12 @@ def test_pictures_are_those_of_render_alone(address, tmp_path):
     """All combinations of options, seeds and scenes: a number, a dict with Mitsuba's types, a file; of two
     workers each takes half of the machine's cores."""
     mrt.register()
-    scenes = [3, mrt.scene_dict(8), str(tmp_path / "mine.xml")]
-    assert cli.main(["export", "1", "--xml", scenes[2]]) == 0
+    nodes = mrt.scene_dict(3)  # seen by three cameras, so that kernels are the same and pictures are not
+    nodes["sensor"]["fov"] = 50.0
+    file = tmp_path / "mine.xml"
+    scenes = [3, nodes, str(file)]
+    assert cli.main(["export", "3", "--xml", scenes[2]]) == 0
+    file.write_text(file.read_text().replace('"fov" value="60"', '"fov" value="40"'))
     small = {"width": 64, "height": 48, "layers": ["depth"]}
     grid = {"scene": scenes, "aa": [1, 2], "seed": np.arange(2)}
     with Client(address, set_as_default=False) as client:
@@ -89,6 +93,7 @@ def test_pictures_are_those_of_render_alone(address, tmp_path):
     half = max(1, usable_cores() // 2)
     assert {threads[row["worker"]] for row in table.rows} == {half}
     assert len(table.rows) == 12
+    assert len({read_exr(tmp_path / "out" / row["file"]).image.tobytes() for row in table.rows}) >= 6
     assert not table.failed
     assert not left_over(tmp_path / "out")
     for row in table.rows:
