@@ -25,6 +25,7 @@ TEXT = "#30343b"
 LABELS = 9.0  # points, of labels at lines
 WORDS: dict[str, Any] = {"fontsize": LABELS, "color": TEXT}  # at axes
 MARKERS = "osD^vPXh"
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")  # exponents
 # curves that are the best at some error, and those that never are
 NOTABLE: dict[str, Any] = {"markersize": 5, "linewidth": 1.6, "elinewidth": 0.8, "zorder": 3}
 OTHERS = NOTABLE | {"markersize": 3, "linewidth": 0.8, "alpha": 0.7, "zorder": 2}
@@ -66,6 +67,21 @@ def plain_numbers(*scales: Axis) -> None:
         scale.set_minor_locator(NullLocator())
 
 
+def powers_of_ten(*scales: Axis) -> None:
+    """Write powers of ten at logarithmic axes of many decades, where smaller ticks would only take time."""
+    from matplotlib.ticker import NullLocator
+
+    for scale in scales:
+        scale.set_major_formatter(_power_of_ten)
+        scale.set_minor_locator(NullLocator())
+
+
+def _power_of_ten(place: float, _: int) -> str:
+    """The label of a tick, in characters of its font: a formula would be parsed for each."""
+    exponent = f"{np.log10(place):.0f}"
+    return "10" + exponent.translate(RAISED)
+
+
 def note(axes: Axes, x: float, y: float, text: str, **looks: Any) -> None:
     """Write a text into a plot, at a place in shares of its width and height."""
     looks = {"fontsize": LABELS, "color": GREY, **looks}
@@ -78,7 +94,7 @@ def label_ends(axes: Axes, ends: Mapping[str, tuple[float, float, str]]) -> None
     Where ends are close to each other, labels move apart, and thin lines lead to them.
     """
     drawn: Any = axes.figure
-    drawn.draw_without_rendering()  # places the axes
+    drawn.get_layout_engine().execute(drawn)  # places the axes
     gap = 1.35 * LABELS * drawn.dpi / 72 / axes.get_window_extent().height
     to_axes = axes.transData - axes.transAxes
     ascending = sorted(ends.items(), key=lambda end: end[1][1])

@@ -108,6 +108,7 @@ def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
     axes.plot(x, lines[THEIRS], color=orange, linewidth=1.4)
     axes.plot(x, lines[OURS], color=blue, linewidth=2.4)
     axes.set(xscale="log", yscale="log", ylim=(0.2, 10 * NONE_RIGHT))
+    diagrams.powers_of_ten(axes.xaxis, axes.yaxis)
     axes.set_xlabel(axis.label, **diagrams.WORDS)
     axes.set_ylabel("error in roundings", **diagrams.WORDS)
     axes.grid(alpha=0.2)
