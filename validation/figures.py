@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +37,7 @@ def error_against_time(*scenes: error_vs_time.Number, quick: bool = False) -> Dr
     """Diagrams of all that a user can choose in scenes, and what to use to get to an error."""
     panels: dict[str, Findings] = {}
     for scene in scenes:
-        cost = error_vs_time.QUICK if quick else error_vs_time.shown(scene)
+        cost = replace(error_vs_time.QUICK, cold=False) if quick else error_vs_time.shown(scene)
         panels |= error_vs_time.choices(scene, cost)
     drawn = [diagrams.work_precision(title, found) for title, found in panels.items()]
     return drawn, error_vs_time.advice(panels)

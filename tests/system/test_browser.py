@@ -6,6 +6,8 @@ docs`` left behind, else one that is built here without running the pages' code.
 
 from __future__ import annotations
 
+import functools
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -77,6 +79,13 @@ def check(tmp_path_factory):
     return folder
 
 
+@functools.cache
+def places_of(page: Path) -> set[str]:
+    """The names of the places of a page that links may lead to."""
+    return set(re.findall(r'id="([^"]*)"', page.read_text()))
+
+
+@functools.cache
 def is_dead(link: str) -> bool:
     """Whether a link leads to a file that does not exist, or to a place that its page does not have."""
     parts = urlparse(link)
@@ -84,7 +93,7 @@ def is_dead(link: str) -> bool:
         return False
     path = Path(unquote(parts.path))
     place = unquote(parts.fragment)
-    return not path.is_file() or (bool(place) and f'id="{place}"' not in path.read_text())
+    return not path.is_file() or (bool(place) and place not in places_of(path))
 
 
 def faults(chromium, page: Path, width: int) -> list[str]:

@@ -42,6 +42,8 @@ def tiny(monkeypatch: Patch, variant: str) -> None:
     monkeypatch.setattr(roughconductor.runtime, "usable_variants", lambda: ["llvm_ad_rgb"])
     cases = {name: scenes.CASES[name] for name in ("1", "3", "5", "crowded")}
     monkeypatch.setattr(scenes, "CASES", cases)
+    # kernels are compiled anew for the first run of a case in tests of mrt.error_vs_time
+    monkeypatch.setattr(error_vs_time, "QUICK", dataclasses.replace(error_vs_time.QUICK, cold=False))
 
 
 def quick(name: str) -> Study:
