@@ -76,7 +76,7 @@ def powers_of_ten(*scales: Axis) -> None:
         scale.set_minor_locator(NullLocator())
 
 
-def _power_of_ten(place: float, _: int) -> str:
+def _power_of_ten(place: float, _: float) -> str:
     """The label of a tick, in characters of its font: a formula would be parsed for each."""
     exponent = f"{np.log10(place):.0f}"
     return "10" + exponent.translate(RAISED)
