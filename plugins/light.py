@@ -123,4 +123,4 @@ class MrtLight(mi.Emitter):
         return mi.ScalarBoundingBox3f(p, p) if is_jit() else mi.BoundingBox3f(p, p)
 
     def to_string(self) -> str:
-        return f"MrtLight[position={self.position}, intensity={self.intensity}]"
+        return f"{type(self).__name__}[position={self.position}, intensity={self.intensity}]"

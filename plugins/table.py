@@ -21,7 +21,8 @@ class Plugin:
     module: str
     class_name: str
     kind: str  #: what it is to Mitsuba: "bsdf", "emitter", "integrator", "shape" or "texture"
-    #: the parameters without defaults, for a small example; arrays stand for bitmaps
+    #: parameters of a small example: those without defaults, and what lets every number show in tests; arrays
+    #: stand for bitmaps
     sample: Mapping[str, Any]
     #: the table of the kernels of ``mrt_whitted`` that its numbers go into: "lights", "materials", "planes",
     #: "quadrics", or "" for none

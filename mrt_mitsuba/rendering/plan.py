@@ -73,7 +73,7 @@ class Exposure(Pass):
     def __str__(self) -> str:
         count = self.places.count
         if self.places.lattice == FILM:
-            return f"{self.places.size} rays a pixel, placed and filtered by the film"
+            return f"{_rays(self.places.size)} a pixel, placed and filtered by the film"
         return f"{count} sample{'s' if count > 1 else ''} a pixel{self.repeated}{_with(self.layers)}"
 
 
@@ -97,7 +97,7 @@ class Refinement(Pass):
 
     def __str__(self) -> str:
         if self.places.lattice == FILM:
-            return f"{self.places.size} rays and more in edge pixels, placed and filtered by the film"
+            return f"{_rays(self.places.size)} and more in edge pixels, placed and filtered by the film"
         return f"{self.places.count} further samples in edge pixels{self.repeated}"
 
 
@@ -131,6 +131,10 @@ class Blur(Pass):
 
     def __str__(self) -> str:
         return f"depth of field: {self.mode}"
+
+
+def _rays(size: int) -> str:
+    return f"{size} ray{'s' if size > 1 else ''}"
 
 
 def _with(layers: frozenset[str]) -> str:
