@@ -49,9 +49,7 @@ def answer(
 
 def error_against_time() -> Answer:
     """All that a user can choose, in the report's scenes and Mitsuba's."""
-    scenes = (0, "Cornell box")
-    if not pages.QUICK:
-        scenes = (0, 1, 2, 3, 4, "Cornell box")
+    scenes = (0,) if pages.QUICK else (0, 1, 2, 3, 4, "Cornell box")
     plots, rows = figures.error_against_time(*scenes, quick=pages.QUICK)
     best = Counter(_kind(row["use"]) for row in rows)
     shown = []
@@ -223,7 +221,8 @@ def _changed(what: str, before: Render, after: Render) -> dict[str, Any]:
 def own_scene(result: mrt.Result) -> pages.Html:
     """Maps of a render in rounds, and stated against true errors."""
     box = mi.cornell_box()
-    box["sensor"]["film"] |= {"width": 96, "height": 96}
+    side = 48 if pages.QUICK else 96
+    box["sensor"]["film"] |= {"width": side, "height": side}
     few = {"seeds": 2, "truth_spp": 64} if pages.QUICK else {}
     honest = figures.stated_and_true(
         {"Cornell box": mi.load_dict(box)}, **few

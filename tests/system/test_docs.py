@@ -9,6 +9,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import forked
 import pytest
 
 from mrt_mitsuba import plugins, render
@@ -34,17 +35,37 @@ pages.QUICK = True
 """
 
 
-# What building the site takes in full, and its test with a twentieth of the rays or fewer repeats
-QUICKER = {"target=0.01)": "target=0.05)", "repeats=5,": "repeats=2,"}
+# What building the site takes in full, and its test with a twentieth of the rays, fewer repeats or pixels
+QUICKER = {
+    "target=0.01)": "target=0.05)",
+    "repeats=5,": "repeats=2,",
+    '"spp": 1024': '"spp": 256',
+    "mi.cornell_box()": "smaller(mi.cornell_box())",
+    "(256, 256, 5)": "(64, 64, 5)",
+    '"resx": 320, "resy": 180': '"resx": 80, "resy": 45',
+    '"sample_visible": False})': '"sample_visible": False}, quick=True)',
+    "height=48)": "height=48, workers=1)",
+}
+SMALLER = """
+def smaller(box):
+    box["sensor"]["film"] |= {"width": 64, "height": 64}
+    return box
+"""
+
+
+def quick(text: str) -> str:
+    """Code of a page made quick."""
+    for amount, fewer in QUICKER.items():
+        text = text.replace(amount, fewer)
+    prepared = PREPARED if re.search("from pages import|import answers", text) else ""
+    return SMALLER + prepared + text
 
 
 def code(path: Path) -> str:
     """All Python of a page, cells that are run and what is only shown, made quick."""
     text = "\n".join(blocks(path, "{code-cell}") + blocks(path, "python"))
     text = re.sub(r"^:tags:.*$", "", text, flags=re.MULTILINE)
-    for amount, fewer in QUICKER.items():
-        text = text.replace(amount, fewer)
-    return PREPARED + text if re.search("from pages import|import answers", text) else text
+    return quick(text) if text else ""
 
 
 @pytest.fixture
@@ -62,13 +83,20 @@ def test_commands_of_the_readme_run(words, mrt_command):
     mrt_command(*shlex.split(words))
 
 
-EXAMPLES = [(example.splitlines()[0], example) for example in blocks(README, "python")]
-EXAMPLES += [(path.stem, code(path)) for path in PAGES if code(path)]
+EXAMPLES = [(example.splitlines()[0], quick(example)) for example in blocks(README, "python")]
 
 
-@pytest.mark.parametrize(("name", "text"), EXAMPLES, ids=[name for name, _ in EXAMPLES])
-def test_pages_run(name, text, run_python, examples):
-    run_python(text, PYTHONPATH=str(examples))
+@pytest.mark.parametrize("text", [text for _, text in EXAMPLES], ids=[name for name, _ in EXAMPLES])
+def test_examples_of_the_readme_run(text, run_python):
+    run_python(text)
+
+
+CODES = {path.stem: code(path) for path in PAGES if code(path)}
+
+
+@pytest.mark.parametrize("name", CODES)
+def test_pages_run(name, examples):
+    forked.run(CODES[name], examples)
     if name == "tutorial":  # whose scene is the file's, but for the rounding of its camera's matrix
         written = read_exr(examples.parent / "mine.exr").image
         same = render(examples / "mine.xml", aa=3, aamode="sobel", focaldist=4.5, focalrange=0.5).image

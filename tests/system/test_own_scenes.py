@@ -187,7 +187,8 @@ def smaller(part: Callable[..., None]) -> Callable[..., None]:
 
 def test_errors_end_at_their_target_and_take_few_rays(monkeypatch):
     monkeypatch.setattr(adaptive, "KINDS", ("texture",))
-    monkeypatch.setattr(adaptive, "TIMED", ("spot",))
+    monkeypatch.setattr(adaptive, "TIMED", ("calm",))  # whose kernels tests below share
+    monkeypatch.setattr(adaptive, "QUICK", ("gloss", "stratified"))
     monkeypatch.setattr(adaptive, "SAMPLERS", ("independent", "multijitter"))
     for part in ("renders_to_an_error", "rays_alone"):
         monkeypatch.setattr(adaptive, part, smaller(getattr(adaptive, part)))
@@ -204,6 +205,9 @@ def test_errors_end_at_their_target_and_take_few_rays(monkeypatch):
 @pytest.mark.filterwarnings("ignore:a few rays rule the error")
 def test_stated_errors_hold_and_means_are_unbiased(monkeypatch):
     monkeypatch.setattr(honest, "SIZE", 32)
+    measured = honest.measured
+    few = 2**11  # rays a pixel of the truth, a thirtieth of whose noise is in it, and is subtracted
+    monkeypatch.setattr(honest, "measured", lambda scene, seeds, rays: measured(scene, seeds, few))
     found = findings(honest.run, quick=True)
     assert found.passed, found.missed
 
@@ -422,13 +426,13 @@ def _assert_true(result: mrt.Result, truth: np.ndarray) -> None:
 def test_errors_are_those_of_the_finished_picture():
     """After a depth of field, which makes them smaller, and in grey where the film is."""
     size = {"width": 64, "height": 48}
-    truth = mrt.render(3, aa=32, aamode="none", lattice="film", **size).image
+    truth = mrt.render(3, aa=20, aamode="none", lattice="film", **size).image
     for target in (0.02, 0.005):
         _assert_true(mrt.render(3, target=target, **size), truth)
     scene = _load("gloss", film={"pixel_format": "luminance"})
     seen: list[Any] = []
     for options in ({}, {"focaldist": 4, "focalrange": 0.5}):
-        truth = mrt.render(scene, spp=2**12, **options).image
+        truth = mrt.render(scene, spp=2**11, **options).image
         result = mrt.render(scene, target=0.03, seed=2, on_round=seen.append, **options)
         _assert_true(result, truth)
         assert_array_equal(seen[-1].image, result.image)
@@ -491,12 +495,14 @@ def test_rays_go_on_until_the_target_is_reached():
     assert np.median(rays) < 1200
 
 
-@pytest.mark.parametrize(("kind", "rfilter"), [("calm", "box"), ("spot", "box"), ("calm", "gaussian")])
-def test_a_target_is_hit_and_not_only_passed(kind, rfilter):
+@pytest.mark.parametrize(
+    ("kind", "rfilter", "size"), [("calm", "box", 64), ("spot", "box", 96), ("calm", "gaussian", 64)]
+)
+def test_a_target_is_hit_and_not_only_passed(kind, rfilter, size):
     """Where rare rays light what seemed quiet, where points of a sequence gain with their number, and under a
     filter, which leaves less of that gain. Stated errors of 12 pictures have a root mean square that is known
-    to 2 %; without calibration spot has 1.06, and calm under a filter 1.8."""
-    scene = load_kind(kind, 96, rfilter=rfilter)
+    to 3 % at most; without calibration spot has 1.06, and calm under a filter 1.8."""
+    scene = load_kind(kind, size, rfilter=rfilter)
     truth, noise = averaged([np.array(mi.render(scene, spp=128, seed=seed)) for seed in range(100, 104)])
 
     def error(picture: np.ndarray) -> float:
