@@ -1,6 +1,6 @@
 """Makes the pictures of README and the front page anew: ``make pictures``.
 
-``python docs/pictures/make.py [--quick] [--out DIR] [NAME ...]``; quick: few rays.
+``python docs/pictures/make.py [--quick] [--out DIR] [NAME ...]``; quick: few rays and pixels.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def equal_time(quick: bool) -> Image.Image:
     """Mitsuba's Cornell box by ``mi.render`` and by ours in the same time, with our stated error and rays."""
     mrt.register()
     box = mi.cornell_box()
-    box["sensor"]["film"] |= {"width": 192, "height": 192}
+    side = 64 if quick else 192
+    box["sensor"]["film"] |= {"width": side, "height": side}
     scene = mi.load_dict(box)
     truth_spp = 64 if quick else 4096
 
@@ -154,7 +155,7 @@ def main(words: list[str] | None = None) -> None:
         metavar="NAME",
         help=f"of {', '.join(PICTURES)}; none: all",
     )
-    parser.add_argument("--quick", action="store_true", help="few rays")
+    parser.add_argument("--quick", action="store_true", help="few rays and pixels")
     parser.add_argument("--out", type=Path, default=HERE, help="folder")
     given = parser.parse_args(words)
     unknown = set(given.names) - {*PICTURES, "rooms"}

@@ -189,7 +189,7 @@ def test_whole_pictures_state_their_error():
     box = mi.cornell_box()
     box["sensor"]["film"] |= {"width": 24, "height": 24}
     scene = mi.load_dict(box)
-    truth = mrt.render(scene, integrator="ptracer", aamode="none", spp=2**13, seed=1).image
+    truth = mrt.render(scene, integrator="ptracer", aamode="none", spp=2**11, seed=1).image
     ratios = []
     for seed in range(5):
         result = mrt.render(scene, integrator="ptracer", aamode="noise", spp=64, seed=seed)
