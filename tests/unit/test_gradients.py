@@ -43,15 +43,16 @@ def scene(**more: Any) -> mi.Scene:
     return mi.load_dict(nodes | more)
 
 
-def moved(parameters: Any, key: str, by: Any) -> None:
-    """Add a number to a parameter, to the first component of a vector or colour, or to the x of a place."""
-    value = parameters[key]
-    if key.endswith("to_world"):
-        parameters[key] = mi.Transform4f().translate(mi.Vector3f(by, 0, 0)) @ mi.Transform4f(value)
-    elif dr.depth_v(value) > 1:
-        parameters[key] = type(value)(value[0] + by, *list(value)[1:])
-    else:
-        parameters[key] = value + by
+def moved(parameters: Any, keys: str, by: Any) -> None:
+    """Add a number to parameters, to the first component of a vector or colour, or to the x of a place."""
+    for key in keys.split():
+        value = parameters[key]
+        if key.endswith("to_world"):
+            parameters[key] = mi.Transform4f().translate(mi.Vector3f(by, 0, 0)) @ mi.Transform4f(value)
+        elif dr.depth_v(value) > 1:
+            parameters[key] = type(value)(value[0] + by, *list(value)[1:])
+        else:
+            parameters[key] = value + by
     parameters.update()
 
 
@@ -94,8 +95,7 @@ def material(**change: Any) -> dict[str, Any]:
 def exact_shape(kind: str, first: str, second: str, radius: float) -> Iterator[tuple]:
     """Its surface is exact: derivatives of a cone's mesh, which other integrators see, are a third off."""
     ball = {"type": kind, first: [0, 4, 0], second: [0, -4, 0], "radius": radius, "segments": 8}
-    for name in ("radius", first, second):
-        yield f"ball.{name}", 1e-2, {"ball": {**ball, "bsdf": MATERIAL}}
+    yield f"ball.radius ball.{first} ball.{second}", 1e-2, {"ball": {**ball, "bsdf": MATERIAL}}
 
 
 TEXTURE = {"type": "checkerboard", "color0": 0.2, "color1": 0.4}
