@@ -48,7 +48,9 @@ def picture(scene: mi.Scene, integrator: Any) -> np.ndarray:
     return np.array(mi.render(scene, integrator=integrator, spp=1, seed=1))
 
 
-@pytest.mark.parametrize("part", [0, 1, pytest.param(2, marks=pytest.mark.attack)])
+@pytest.mark.parametrize(
+    "part", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.attack)]
+)
 def test_edited_scenes_are_drawn_as_scenes_made_anew(part, variant, tmp_path):
     """To the bit, and those made anew in another process."""
     mi.set_log_level(mi.LogLevel.Error)

@@ -185,6 +185,7 @@ def smaller(part: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+@pytest.mark.slow
 def test_errors_end_at_their_target_and_take_few_rays(monkeypatch):
     monkeypatch.setattr(adaptive, "KINDS", ("texture",))
     monkeypatch.setattr(adaptive, "TIMED", ("calm",))  # whose kernels tests below share

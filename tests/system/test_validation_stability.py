@@ -17,6 +17,7 @@ from mrt_mitsuba.validation.tools.study import findings
 pytestmark = pytest.mark.usefixtures("variant")
 
 
+@pytest.mark.slow
 def test_every_case_holds_and_is_a_row_with_a_mark():
     whole = findings(stability.run, quick=True)
     assert whole.missed == set()
