@@ -154,7 +154,9 @@ def test_a_texture_that_loading_uses_up():
         ("llvm_ad_mono_polarized", {"type": "mrt_bsdf", "alpha": 0.3}),
         # three coefficients of sizes far apart, and numbers that are wavelengths
         ("llvm_ad_spectral", {"type": "mrt_bsdf", "diffuse_reflectance": rgb(0.7, 0.1, 0.3)}),
-        pytest.param("llvm_ad_spectral", {"type": "roughconductor", "material": "Cu"}, marks=pytest.mark.slow),
+        pytest.param(
+            "llvm_ad_spectral", {"type": "roughconductor", "material": "Cu"}, marks=pytest.mark.slow
+        ),
     ],
     indirect=["variant"],
 )
