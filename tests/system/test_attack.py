@@ -372,7 +372,12 @@ PROGRAMS = {
 }
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+SLOW = {"a scene that another thread edits"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in PROGRAMS]
+)
 @pytest.mark.parametrize("attempt", range(ROUNDS))
 def test_threads_and_interrupts(run_python, name, attempt):
     code, door, said = PROGRAMS[name]

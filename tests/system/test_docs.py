@@ -94,7 +94,12 @@ def test_examples_of_the_readme_run(text, run_python):
 CODES = {path.stem: code(path) for path in PAGES if code(path)}
 
 
-@pytest.mark.parametrize("name", CODES)
+SLOW = {"error_against_time", "extreme_cases", "left_out"}  # studies, whose parts have tests of their own
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CODES]
+)
 def test_pages_run(name, examples):
     forked.run(CODES[name], examples)
     if name == "tutorial":  # whose scene is the file's, but for the rounding of its camera's matrix

@@ -65,6 +65,7 @@ def test_a_target_takes_as_many_rays_as_independent_noise_needs(share):
     assert 0.9 < result.error.rmse / target < 1.03
 
 
+@pytest.mark.slow
 def test_intervals_of_four_pixels_hold_as_often_as_they_say():
     """The upper end is exceeded by a fortieth or less: with a chance of 0.3 %, so in 400 renders by more than
     eight once in 10⁵ sets of seeds. Without its widening, by 4.8 %: by so few, once in a hundred."""

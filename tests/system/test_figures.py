@@ -112,6 +112,7 @@ def test_stated_errors_are_true_in_the_figure():
     assert [len(drawn.axes) for drawn in figures.maps(result)] == [2, 2]  # each with its bar of colours
 
 
+@pytest.mark.slow
 def test_a_study_draws_what_pages_show():
     cost = error_vs_time.Cost(
         size=(24, 18),

@@ -497,7 +497,12 @@ def test_rays_go_on_until_the_target_is_reached():
 
 
 @pytest.mark.parametrize(
-    ("kind", "rfilter", "size"), [("calm", "box", 96), ("spot", "box", 96), ("calm", "gaussian", 64)]
+    ("kind", "rfilter", "size"),
+    [
+        ("calm", "box", 96),
+        pytest.param("spot", "box", 96, marks=pytest.mark.slow),
+        ("calm", "gaussian", 64),
+    ],
 )
 def test_a_target_is_hit_and_not_only_passed(kind, rfilter, size):
     """Where rare rays light what seemed quiet, where points of a sequence gain with their number, and under a

@@ -14,7 +14,7 @@ MOST = 1_000_000  # bytes of all pictures, which every clone loads
 NAMES = (
     "scene3.png",
     "equal_time.png",
-    "error_against_time.png",
+    pytest.param("error_against_time.png", marks=pytest.mark.slow),
     pytest.param("check.png", marks=pytest.mark.browser),
 )
 

@@ -54,8 +54,8 @@ def quick(name: str) -> Study:
 
 
 # Laws, stability and adaptive have tests of their own; the pictures of roughconductor, see below
-PASSING = "roughconductor:pointwise filters"
-LONG = "stock scenes error_vs_time needs speed"  # in part tried with faults as well, below
+PASSING = "roughconductor:pointwise"
+LONG = "stock scenes filters error_vs_time needs speed"  # in part tried with faults as well, below
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ faults("error_vs_time", wrong_cases("sampling", {"aamode": "sobel"}, {"aa": 1}),
 faults("error_vs_time", wrong_cases("path", {"spp": 16}, {"spp": 8}), "theory")
 faults("error_vs_time", wrong_cases("path", {"spp": 256}, {"spp": 32}), "error of the reference")
 faults("error_vs_time", wrong_cases("whitted", {}, {"integrator": "direct"}), "default cut-off")
-faults("stock:direct", wrapped(mrt, "render", mirrors_too), "share of pixels off")
+faults("stock:direct", wrapped(mrt, "render", mirrors_too), "share of pixels off", slow=True)
 faults("roughconductor:pointwise", ROUGH, "value")
 faults("bsdf_laws:known", SCHLICK, "published albedos")
 

@@ -106,7 +106,12 @@ STOCK = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", STOCK)
+SLOW = {"roughplastic"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in STOCK]
+)
 def test_stock_bsdfs_fail_what_is_known(name, capsys):
     parameters, known = STOCK[name]
     check = mrt.check_bsdf({"type": name, **parameters}, quick=True)

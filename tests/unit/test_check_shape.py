@@ -178,6 +178,7 @@ def test_each_mistake_exceeds_its_own_figures(mistake):
     assert "loaded object" in check.laws["scale"].skipped
 
 
+@pytest.mark.slow
 def test_small_faults_are_found_in_full():
     shapes = power.KINDS["shape"]
     spread = next(fault for fault in shapes.faults if fault.figure == "spread")
