@@ -70,8 +70,8 @@ DOCS = Cost(
     lattices=("centered",),
     cold=False,
 )
-# Widths of scenes in the documentation, at which four rays in each pixel take some 50 ms
-WIDTHS: dict[Number, int] = {0: 720, 1: 640, 2: 560, 3: 480, 4: 400}
+# Widths of scenes in the documentation, at which eight rays in each pixel take some 50 ms
+WIDTHS: dict[Number, int] = {0: 512, 1: 448, 2: 400, 3: 336, 4: 288}
 
 
 def shown(scene: Number) -> Cost:
