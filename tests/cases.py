@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import pytest
@@ -15,3 +16,8 @@ class Cases(list[Any]):
 
     def __call__(self, *values: Any, name: str | None = None, slow: bool = False) -> None:
         self.append(pytest.param(*values, id=name, marks=[pytest.mark.slow] * slow))
+
+
+def but_slow(names: Iterable[str], slow: Collection[str]) -> list[Any]:
+    """Names of cases, with the mark of those that take more than about ten seconds."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name in slow)) for name in names]

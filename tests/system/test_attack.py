@@ -16,6 +16,7 @@ from typing import Any
 
 import mitsuba as mi
 import pytest
+from cases import but_slow
 from nodes import TRIANGLE, scene_xml
 
 import mrt_mitsuba as mrt
@@ -372,12 +373,7 @@ PROGRAMS = {
 }
 
 
-SLOW = {"a scene that another thread edits"}
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in PROGRAMS]
-)
+@pytest.mark.parametrize("name", but_slow(PROGRAMS, {"a scene that another thread edits"}))
 @pytest.mark.parametrize("attempt", range(ROUNDS))
 def test_threads_and_interrupts(run_python, name, attempt):
     code, door, said = PROGRAMS[name]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import forked
 import pytest
+from cases import but_slow
 
 from mrt_mitsuba import plugins, render
 from mrt_mitsuba.command import main, options, registry
@@ -97,9 +98,7 @@ CODES = {path.stem: code(path) for path in PAGES if code(path)}
 SLOW = {"error_against_time", "extreme_cases", "left_out"}  # studies, whose parts have tests of their own
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CODES]
-)
+@pytest.mark.parametrize("name", but_slow(CODES, SLOW))
 def test_pages_run(name, examples):
     forked.run(CODES[name], examples)
     if name == "tutorial":  # whose scene is the file's, but for the rounding of its camera's matrix

@@ -12,7 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from cases import Cases
+from cases import Cases, but_slow
 from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
@@ -54,13 +54,10 @@ def quick(name: str) -> Study:
 
 
 # Laws, stability and adaptive have tests of their own; the pictures of roughconductor, see below
-PASSING = "roughconductor:pointwise"
-LONG = "stock scenes filters error_vs_time needs speed"  # in part tried with faults as well, below
+PASSING = ["roughconductor:pointwise", "stock", "scenes", "filters", "error_vs_time", "needs", "speed"]
 
 
-@pytest.mark.parametrize(
-    "name", [*PASSING.split(), *(pytest.param(name, marks=pytest.mark.slow) for name in LONG.split())]
-)
+@pytest.mark.parametrize("name", but_slow(PASSING, PASSING[1:]))  # whole studies
 def test_study_passes(name):
     study = quick(name)
     assert study.passed, study.missed

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cases import but_slow
 from nodes import rgb
 from unit import specimens
 from unit.specimens import exceeded
@@ -106,12 +107,7 @@ STOCK = {
 }  # fmt: skip
 
 
-SLOW = {"roughplastic"}
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in STOCK]
-)
+@pytest.mark.parametrize("name", but_slow(STOCK, {"roughplastic"}))
 def test_stock_bsdfs_fail_what_is_known(name, capsys):
     parameters, known = STOCK[name]
     check = mrt.check_bsdf({"type": name, **parameters}, quick=True)
