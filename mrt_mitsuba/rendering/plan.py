@@ -71,10 +71,9 @@ class Exposure(Pass):
     name = "rendering"
 
     def __str__(self) -> str:
-        count = self.places.count
         if self.places.lattice == FILM:
-            return f"{_rays(self.places.size)} a pixel, placed and filtered by the film"
-        return f"{count} sample{'s' if count > 1 else ''} a pixel{self.repeated}{_with(self.layers)}"
+            return f"{_counted(self.places.size, 'ray')} a pixel, placed and filtered by the film"
+        return f"{_counted(self.places.count, 'sample')} a pixel{self.repeated}{_with(self.layers)}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +96,8 @@ class Refinement(Pass):
 
     def __str__(self) -> str:
         if self.places.lattice == FILM:
-            return f"{_rays(self.places.size)} and more in edge pixels, placed and filtered by the film"
+            rays = _counted(self.places.size, "ray")
+            return f"{rays} and more in edge pixels, placed and filtered by the film"
         return f"{self.places.count} further samples in edge pixels{self.repeated}"
 
 
@@ -133,8 +133,8 @@ class Blur(Pass):
         return f"depth of field: {self.mode}"
 
 
-def _rays(size: int) -> str:
-    return f"{size} ray{'s' if size > 1 else ''}"
+def _counted(number: int, thing: str) -> str:
+    return f"{number} {thing}{'s' if number > 1 else ''}"
 
 
 def _with(layers: frozenset[str]) -> str:

@@ -198,8 +198,8 @@ def switch(law: Law, case: Case) -> None:
     here = mi.variant()
     few = case.few(case.pairs, 1000, 1000)
     other = next(v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here)
-    with runtime.within(other):
-        pass
+    runtime.use(other)
+    runtime.use(here)
     candidates = {"that was loaded before": case.plugin}
     if case.description is not None:
         candidates["loaded anew"] = case.load()
