@@ -8,6 +8,7 @@
 # make bench  [ARGS="--compare F"]      time scenes 0-4 into out/bench.json
 # make test-gpu, make bench-gpu        the tests of what runs on a device, and its times, on an NVIDIA GPU
 # make setup                            the environment alone: .venv with the commands mrt and mrt-validate
+# make develop                          the same with all that tests, documentation and style need
 # make lint, make types, make package   style, types, wheel and sdist
 PYTHON ?= python3
 VENV   ?= .venv
@@ -20,8 +21,10 @@ BIN  := $(VENV)/bin
 # One stamp per set of extras: installing one leaves the others as they are.
 STAMP := $(VENV)/.mrt
 
-.PHONY: setup render test test-gpu fuzz attack bench bench-gpu docs pictures browser lint types package clean
+.PHONY: setup develop render test test-gpu fuzz attack bench bench-gpu docs pictures browser lint types package clean
 setup: $(STAMP)-base
+
+develop: $(STAMP)-all
 
 render: $(STAMP)-base
 	@mkdir -p $(OUT)
@@ -103,3 +106,7 @@ $(STAMP)-browser: pyproject.toml | $(BIN)/python
 $(STAMP)-dev: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@ $(STAMP)-base
+
+$(STAMP)-all: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[test,docs,validation,browser,dev]'
+	@touch $@ $(STAMP)-base $(STAMP)-test $(STAMP)-docs $(STAMP)-browser $(STAMP)-dev

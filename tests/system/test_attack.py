@@ -373,7 +373,9 @@ PROGRAMS = {
 }
 
 
-@pytest.mark.parametrize("name", but_slow(PROGRAMS, {"a scene that another thread edits"}))
+@pytest.mark.parametrize(
+    "name", but_slow(PROGRAMS, {"a scene that another thread edits", "the same by mi.render"})
+)
 @pytest.mark.parametrize("attempt", range(ROUNDS))
 def test_threads_and_interrupts(run_python, name, attempt):
     code, door, said = PROGRAMS[name]

@@ -95,7 +95,8 @@ def test_examples_of_the_readme_run(text, run_python):
 CODES = {path.stem: code(path) for path in PAGES if code(path)}
 
 
-SLOW = {"error_against_time", "extreme_cases", "left_out"}  # studies, whose parts have tests of their own
+# Studies and others whose parts have tests of their own
+SLOW = {"error_against_time", "extreme_cases", "left_out", "sweeps", "ledger", "gallery", "filters"}
 
 
 @pytest.mark.parametrize("name", but_slow(CODES, SLOW))
@@ -108,6 +109,7 @@ def test_pages_run(name, examples):
         assert abs(written - same).mean() < 1e-6
 
 
+@pytest.mark.slow
 def test_the_worked_example_passes_its_tests(run_command, examples):
     words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", examples)
     done = run_command(sys.executable, *words, examples / "test_matte.py", PYTEST_ADDOPTS=None)

@@ -185,6 +185,7 @@ def test_the_shape_of_a_tail_is_that_of_twice_as_many_values_as_make_up_half_of_
         assert (other != shape) == (place <= 2 * half), place
 
 
+@pytest.mark.slow
 def test_whole_pictures_state_their_error():
     """Light tracing has no rays of pixels: pictures with seeds of their own tell its error."""
     box = mi.cornell_box()

@@ -55,7 +55,7 @@ def test_edited_scenes_are_drawn_as_scenes_made_anew(part, variant, tmp_path):
     """To the bit, and those made anew in another process."""
     mi.set_log_level(mi.LogLevel.Error)
     first = 20 + 1000 * part
-    count = (4, 12, 72 * ROUNDS)[part]
+    count = (2, 14, 72 * ROUNDS)[part]
     path = tmp_path / "anew.npz"
     pictures = {
         number: list(edits.live(content, done)) for number, content, done in edits.stories(first, count)

@@ -46,7 +46,7 @@ films(PATH, "", ["R", "G", "B", "error.Y", "samples.Y"])
 films(PATH, CROP + GREY, ["Y", "error.Y", "samples.Y"])
 films(PATH, RGBA, ["R", "G", "B", "A", "error.Y", "samples.Y"])
 films(PRB, "", ["R", "G", "B", "error.Y", "samples.Y"])
-films('<integrator type="ptracer"/>', "", ["R", "G", "B", "error.Y", "samples.Y"])
+films('<integrator type="ptracer"/>', "", ["R", "G", "B", "error.Y", "samples.Y"], slow=True)
 films(AOV, CROP + RGBA, None)
 
 

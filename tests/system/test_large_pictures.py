@@ -119,8 +119,10 @@ FILM = """
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs Linux to measure memory")
 @pytest.mark.parametrize(
     ("code", "size", "least", "more"),
-    [(REPORT, 1536, 112, 1.5), (FILM, 512, 470, 0.4)],
-    ids=["report", "film"],
+    [
+        pytest.param(REPORT, 1536, 112, 1.5, id="report"),
+        pytest.param(FILM, 512, 470, 0.4, id="film", marks=pytest.mark.slow),
+    ],
 )
 def test_peak_memory_stays_within_the_budget(run_python, code, size, least, more):
     """With room for it, the same picture takes more: the bound is kept by the parts, not by luck."""

@@ -501,7 +501,7 @@ def test_rays_go_on_until_the_target_is_reached():
     [
         ("calm", "box", 96),
         pytest.param("spot", "box", 96, marks=pytest.mark.slow),
-        ("calm", "gaussian", 64),
+        pytest.param("calm", "gaussian", 64, marks=pytest.mark.slow),
     ],
 )
 def test_a_target_is_hit_and_not_only_passed(kind, rfilter, size):

@@ -425,6 +425,7 @@ def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(waiting, tmp_p
     assert set(children()) <= set(before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("back", [True, False][:ROUNDS])
 def test_a_scheduler_killed_ends_the_sweep_and_a_second_run_finishes_it(mortal, tmp_path, back):
     """Also where one comes back at once under its address, without its workers."""
