@@ -507,7 +507,7 @@ def test_rays_go_on_until_the_target_is_reached():
 def test_a_target_is_hit_and_not_only_passed(kind, rfilter, size):
     """Where rare rays light what seemed quiet, where points of a sequence gain with their number, and under a
     filter, which leaves less of that gain. Stated errors of 12 pictures have a root mean square that is known
-    to 3 % at most; without calibration spot has 1.06, and calm under a filter 1.8."""
+    to 3 % at most; without calibration spot has 1.06."""
     scene = load_kind(kind, size, rfilter=rfilter)
     truth, noise = averaged([np.array(mi.render(scene, spp=128, seed=seed)) for seed in range(100, 104)])
 

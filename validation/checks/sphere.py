@@ -169,9 +169,9 @@ def hold_small(law: Law, cells: Cells, counts: Array, known: float, at: Lanes = 
     counts = np.where(np.isfinite(counts[1]), counts, 0)  # where they are not, the law ``finite`` says so
     chances = chances_of(counts, known)
     cell = cells.bounds(int(chances.argmin()))
-    law.hold("small", sidak(chances.min(), 2 * len(chances)), at, cell=cell)
+    law.hold("small", least_of(chances, len(chances)), at, cell=cell)
     chances = np.concatenate([chances_of(summed(counts, row), known) for row in cells.rows()])
-    law.hold("slices", sidak(chances.min(), 2 * len(chances)), at)
+    law.hold("slices", least_of(chances, len(chances)), at)
 
 
 def chances_of(counts: Array, known: float) -> Array:
@@ -181,6 +181,11 @@ def chances_of(counts: Array, known: float) -> Array:
     many = stats.poisson.sf(seen - 1, expected + room)
     few = stats.poisson.cdf(seen, expected - room)
     return np.minimum(many, np.where(expected > room, few, 1))
+
+
+def least_of(chances: Array, tests: int) -> float:
+    """The chance that the least of so many tests is as low as that of ``chances``, each of many or of few."""
+    return sidak(chances.min(), 2 * tests)
 
 
 def in_order(parts: Sequence[Cells]) -> Cells:
