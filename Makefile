@@ -32,7 +32,7 @@ render: $(STAMP)-base
 	@echo "The picture is in $(OUT)/"
 
 test: $(STAMP)-test
-	$(BIN)/python -m pytest -n 3 --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 fuzz: $(STAMP)-test
 	$(BIN)/python -m pytest -m fuzz --hypothesis-profile=long --hypothesis-show-statistics $(ARGS)

@@ -329,6 +329,7 @@ jinja2 scipy matplotlib closes
 """
 
 
+@pytest.mark.slow
 def test_doors_say_what_is_not_installed(run_python):
     cases = [(["jinja2"], HERE), (["scipy"], HERE), (["matplotlib"], HERE)]
     cases += [(["dask"], [*HERE, "sweep"]), (["psutil"], [*HERE, "sweep"])]

@@ -70,6 +70,7 @@ def test_filters_and_updates_on_a_device(variant):
     assert not np.array_equal(after, before[0])
 
 
+@pytest.mark.slow
 def test_make_test_gpu_runs_its_selection_where_it_is_told_to(run_command):
     """And ends with an error where the device is not there."""
     tests = (Path(__file__), Path(__file__).parents[1] / "unit" / "test_parameters.py")

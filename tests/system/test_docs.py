@@ -96,7 +96,16 @@ CODES = {path.stem: code(path) for path in PAGES if code(path)}
 
 
 # Studies and others whose parts have tests of their own
-SLOW = {"error_against_time", "extreme_cases", "left_out", "sweeps", "ledger", "gallery", "filters"}
+SLOW = {
+    "error_against_time",
+    "extreme_cases",
+    "left_out",
+    "sweeps",
+    "ledger",
+    "gallery",
+    "filters",
+    "blender",
+}
 
 
 @pytest.mark.parametrize("name", but_slow(CODES, SLOW))

@@ -479,6 +479,7 @@ def test_every_pixel_has_its_place_shape_and_material():
     assert found["uv.V"].max() <= 1
 
 
+@pytest.mark.slow
 def test_rays_go_on_until_the_target_is_reached():
     """By more rays than any target takes: 850 to 1,620, with 24 seeds; the median is 1,070."""
     box = mi.cornell_box()

@@ -13,7 +13,7 @@ FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
 MOST = 1_000_000  # bytes of all pictures, which every clone loads
 NAMES = (
     "scene3.png",
-    "equal_time.png",
+    pytest.param("equal_time.png", marks=pytest.mark.slow),
     pytest.param("error_against_time.png", marks=pytest.mark.slow),
     pytest.param("check.png", marks=pytest.mark.browser),
 )

@@ -411,6 +411,7 @@ def waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(waiting, tmp_path):
     import psutil
 

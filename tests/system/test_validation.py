@@ -130,7 +130,9 @@ def wrong_cases(trade: str, where: dict[str, Any], change: dict[str, Any]) -> Fa
 
 faults = Cases()
 faults("filters:noise", wrapped(filters, "sobel_edges", lambda f, image, **_: f(image)), "share of flat")
-faults("filters:depth_of_field", wrapped(filters, "gaussian_dof", moved_blur), "corrected / report")
+faults(
+    "filters:depth_of_field", wrapped(filters, "gaussian_dof", moved_blur), "corrected / report", slow=True
+)
 faults("error_vs_time", wrong_cases("sampling", {"aa": 4}, {"aa": 1}), "RMSE of none aa=4")
 faults(
     "error_vs_time", wrong_cases("sampling", {"aamode": "sobel"}, {"aa": 1}), "RMSE of sobel aa=4", slow=True

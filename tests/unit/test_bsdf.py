@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cases import but_slow
 from numpy.testing import assert_allclose
 
 import mrt_mitsuba as mrt
@@ -48,7 +49,7 @@ def draw(bsdf: mi.BSDF, wi: np.ndarray, count: int) -> probe.Lanes:
     return probe.Probe(bsdf).sample(probe.Lanes(wi=wi, u=numbers, uv=np.zeros(2)))
 
 
-@pytest.mark.parametrize("name", bsdf_laws.MATERIALS)
+@pytest.mark.parametrize("name", but_slow(bsdf_laws.MATERIALS, {"narrow", "textured"}))
 def test_obeys_the_laws_of_any_bsdf(name):
     """Sampling, weights, energy, reciprocity, gradients and the others."""
     found = mrt.check_bsdf({"type": "mrt_bsdf", **bsdf_laws.MATERIALS[name]}, quick=True)

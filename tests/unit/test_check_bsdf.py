@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from cases import but_slow
+from cases import Cases, but_slow
 from nodes import rgb
 from unit import specimens
 from unit.specimens import exceeded
@@ -71,10 +71,14 @@ def test_each_mistake_exceeds_its_own_figures(name, registered, capsys):
         assert "nested.alpha.value (detached)" in check.laws["gradients"].note
 
 
-FOUND = [(name, fault) for name, kind in power.KINDS.items() for fault in kind.faults]
+FOUND = Cases()
+for kind_of_plugin, its_laws in power.KINDS.items():
+    for known in its_laws.faults:
+        takes_a_full_check = bool(np.isinf(known.quick))
+        FOUND(kind_of_plugin, known, name=known.what, slow=takes_a_full_check)
 
 
-@pytest.mark.parametrize(("kind", "fault"), FOUND, ids=[fault.what for _, fault in FOUND])
+@pytest.mark.parametrize(("kind", "fault"), FOUND)
 def test_faults_three_times_as_large_as_documented_are_found(kind, fault, variant):
     power.register(runtime.SLOW, variant)
     quick = np.isfinite(fault.quick)
@@ -122,7 +126,7 @@ def test_stock_bsdfs_fail_what_is_known(name, capsys):
 @pytest.mark.parametrize(
     "bsdf",
     [
-        {"type": "roughconductor", "alpha": 1e-4},
+        pytest.param({"type": "roughconductor", "alpha": 1e-4}, marks=pytest.mark.slow),
         {"type": "mrt_bsdf", "alpha": 1e-8, "diffuse_reflectance": 0.0, "fresnel": "unity"},
     ],
 )
@@ -357,7 +361,7 @@ FAULTS = {  # the law, and whether a quick check finds it, too
 }
 
 
-@pytest.mark.parametrize("fault", but_slow(FAULTS, {"a slice left out"}))
+@pytest.mark.parametrize("fault", but_slow(FAULTS, {"a slice left out", "a ring left out"}))
 def test_faults_in_narrow_places(fault):
     law, quick = FAULTS[fault]
     mi.register_bsdf("lambert", lambert(fault))

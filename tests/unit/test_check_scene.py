@@ -69,7 +69,7 @@ def test_a_sound_scene(scene, capsys, tmp_path):
     assert "SmoothDiffuse paint" in (tmp_path / "out" / "index.html").read_text()
 
 
-def test_the_pixel_and_its_object_are_found(scene, capsys):
+def test_the_pixel_and_its_object_are_found(scene, capsys, monkeypatch):
     poisoned()
     path = scene("poisoned")
     found = mrt.check_scene(path, quick=True)
@@ -78,6 +78,8 @@ def test_the_pixel_and_its_object_are_found(scene, capsys):
     assert found.fault.culprit == "the BSDF Changed 'paint', on Sphere 'ball'"
     x, y = found.fault.crop[:2]
     assert abs(x - 12) <= 2 and abs(y - 8) <= 2  # the middle of the picture is seen along the normal
+    assert "the smallest crop: 1x1" in str(found)
+    monkeypatch.setattr(mrt, "check_scene", lambda *_, **__: found)
     assert cli.main(["check", path, "quick=1"]) == 1
     assert "the smallest crop: 1x1" in capsys.readouterr().out
     assert "Made by the BSDF" in found._repr_html_()
@@ -133,10 +135,16 @@ def failed(light):
     return {name.split(": ")[1] for name in found.failed if name.startswith("emitter")}
 
 
+LONG = (("sunsky", "llvm_ad_rgb"), ("envmap", "scalar_rgb"), ("envmap", "llvm_ad_spectral"))
+
+
 @pytest.mark.usefixtures("lights_only")
 @pytest.mark.parametrize(
     ("name", "variant"),
-    [*((name, "llvm_ad_rgb") for name in STOCK), ("envmap", "scalar_rgb"), ("envmap", "llvm_ad_spectral")],
+    [
+        *((name, "llvm_ad_rgb") for name in STOCK if name != "sunsky"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in LONG),
+    ],
     indirect=["variant"],
 )
 def test_stock_emitters_and_ours(name, variant):

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cases import but_slow
 from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
@@ -43,7 +44,7 @@ SHAPES: dict[str, tuple[dict[str, Any], set[str], set[str]]] = {
 }
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", but_slow(SHAPES, {"ellipsoidsmesh"}))
 def test_stock_shapes_and_ours(name):
     parameters, known, senseless = SHAPES[name]
     if "to_world" in parameters:

@@ -124,7 +124,7 @@ DEEP = {"type": "mrt_whitted", "max_depth": 6, "bounce_budget": "plain", "clamp"
 ROOM = {"type": "sphere", "radius": 20.0, "flip_normals": True}
 ROOM["bsdf"] = {"type": "mrt_bsdf", "fresnel": "unity", "diffuse_reflectance": 0.1}
 FACING = {"integrator": DEEP, "room": ROOM, **material(fresnel="unity")}
-slopes("ball.bsdf.specular_reflectance.value", 5e-3, FACING)
+slopes("ball.bsdf.specular_reflectance.value", 5e-3, FACING, slow=True)
 # Next to quadrics that stand before it in the tables, and behind the camera
 GROUP = group([[x, 1, 9, x, 0, 9, 0.1] for x in range(3)], kind="cone")
 CONE = {"type": "mrt_cone", "apex": [0, 4, 0], "base_center": [0, -4, 0], "radius": 2.0, "segments": 8}

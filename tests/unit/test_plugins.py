@@ -271,7 +271,13 @@ def four_threads():
 
 
 @pytest.mark.usefixtures("four_threads")
-@pytest.mark.parametrize("key", ["floor.bsdf.specular_reflectance.value", "light.intensity.value"])
+@pytest.mark.parametrize(
+    "key",
+    [
+        pytest.param("floor.bsdf.specular_reflectance.value", marks=pytest.mark.slow),
+        "light.intensity.value",
+    ],
+)
 def test_derivatives_go_backwards_through_mirrors(key):
     """As forwards; a quarter of it came out in most runs with four threads, as a branch gave back the same
     object each time, into which Dr.Jit had written its result.

@@ -141,11 +141,15 @@ class Study:
 
     def each(self, title: str, items: Collection[Item]) -> Iterator[Item]:
         """Yield items and show progress; frees scenes, which would slow down the kernels of later ones."""
-        with self.progress.stage(title, len(items)) as advance:
-            for item in items:
-                yield item
-                gc.collect()
-                advance(1)
+        gc.freeze()  # collecting is quick where what was there before is left alone
+        try:
+            with self.progress.stage(title, len(items)) as advance:
+                for item in items:
+                    yield item
+                    gc.collect()
+                    advance(1)
+        finally:
+            gc.unfreeze()
 
     def summary(self) -> Values:
         """The study in values of JSON; infinite and undefined numbers become text."""
