@@ -70,7 +70,7 @@ pictures: $(STAMP)-browser
 
 # The site as make docs left it; if it has not, one without what the pages' code shows
 browser: $(STAMP)-browser
-	$(BIN)/python -m pytest -m browser $(ARGS)
+	$(BIN)/python -m pytest -m browser $(ARGS) tests/system/test_browser.py tests/system/test_pictures.py
 
 # Both are tried, in an environment of their own, before they are left in dist/
 package: $(STAMP)-dev $(STAMP)-test

@@ -80,6 +80,7 @@ def test_no_native_code_from_the_folders_of_process_and_scene(run_python, mrt_co
     assert not sign.exists()
 
 
+@pytest.mark.slow
 def test_hundreds_of_python_shapes_load(variant, tmp_path):
     """Loaded in parallel, 300 of them overflowed the stack each time."""
     count = 400 if ROUNDS == 1 else 10_000

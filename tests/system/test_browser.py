@@ -96,30 +96,32 @@ def is_dead(link: str) -> bool:
     return not path.is_file() or (bool(place) and place not in places_of(path))
 
 
-def faults(chromium, page: Path, width: int) -> list[str]:
-    """What is wrong with a page in a window of a width, in pixels."""
+def faults(chromium, page: Path) -> list[str]:
+    """What is wrong with a page in windows of ``WIDTHS``."""
     said = []
-    tab = chromium.new_page(viewport={"width": width, "height": 900})
+    tab = chromium.new_page()
     tab.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
     tab.on("pageerror", lambda error: said.append(str(error)))
     tab.goto(page.as_uri())
-    facts = tab.evaluate(FACTS)
+    wrong = []
+    for width in WIDTHS:
+        tab.set_viewport_size({"width": width, "height": 900})
+        facts = tab.evaluate(FACTS)
+        if facts["width"] > width:
+            wrong.append(f"{facts['width']} pixels wide in a window of {width}")
+        if width == max(WIDTHS):
+            wrong += [f"code cut off: {text}" for text in facts["cut"]]
     tab.close()
-    wrong = [f"console: {text}" for text in said]
+    wrong += [f"console: {text}" for text in said]
     wrong += [f"broken picture: {source}" for source in facts["broken"]]
     wrong += [f"dead link: {link}" for link in facts["links"] if is_dead(link)]
-    if facts["width"] > width:
-        wrong.append(f"{facts['width']} pixels wide in a window of {width}")
-    if width == max(WIDTHS):
-        wrong += [f"code cut off: {text}" for text in facts["cut"]]
     return wrong
 
 
-@pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("pages", ["site", "check", "report"])
-def test_pages_are_whole(pages, width, chromium, request) -> None:
+def test_pages_are_whole(pages, chromium, request) -> None:
     folder = request.getfixturevalue(pages)
-    wrong = {page.name: faults(chromium, page, width) for page in sorted(folder.rglob("*.html"))}
+    wrong = {page.name: faults(chromium, page) for page in sorted(folder.rglob("*.html"))}
     assert wrong and not {name: found for name, found in wrong.items() if found}
 
 
@@ -132,6 +134,6 @@ def test_faults_of_a_page_are_found(chromium, tmp_path) -> None:
         "<article><pre style='width: 20px; overflow: auto'>far too long</pre></article>"
         "<script>console.error('loud'); undefined.name</script>"
     )
-    found = faults(chromium, page, 1200)
+    found = faults(chromium, page)
     for word in ("loud", "undefined", "broken picture", "none.html", "#none", "1300", "far too long"):
         assert any(word in fault for fault in found), word

@@ -306,6 +306,7 @@ print(len(mi.load_dict(scene).shapes()))
 """
 
 
+@pytest.mark.slow
 def test_somebody_elses_wrapper_is_not_taken_for_ours(run_python):
     """Without ours, so many cones end in a RecursionError."""
     assert run_python(WRAPPERS).stdout.splitlines() == ["1500 True", "1500 2", "1 2", "1500"]

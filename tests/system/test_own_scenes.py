@@ -524,6 +524,7 @@ def test_a_target_is_hit_and_not_only_passed(kind, rfilter, size):
     assert np.sqrt(np.mean(stated**2)) < 1
 
 
+@pytest.mark.slow
 def test_an_error_above_the_target_is_warned_of():
     """Each picture whose stated error is a twentieth above the target, and none that is below."""
     scene = load_kind("glass", 48)

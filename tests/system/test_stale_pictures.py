@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cases import but_slow
 from nodes import rgb, sensor
 from numpy.testing import assert_array_equal
 
@@ -178,7 +179,7 @@ def foreign_light(where: str) -> str:
 
 @both_doors
 @pytest.mark.parametrize("where", ["instance", "class", "module"])
-@pytest.mark.parametrize("what", ["texture", "texture of a light", "light"])
+@pytest.mark.parametrize("what", but_slow(["texture", "texture of a light", "light"], {"texture of a light"}))
 def test_what_others_wrote_in_python_is_asked_each_time(variant, door, what, where):
     LEVEL[0] = 0.2
     if what == "texture":

@@ -85,6 +85,7 @@ def test_the_pixel_and_its_object_are_found(scene, capsys, monkeypatch):
     assert "Made by the BSDF" in found._repr_html_()
 
 
+@pytest.mark.slow
 def test_a_light_that_is_no_number_and_instances():
     group = {"type": "shapegroup", "a": {"type": "sphere"}}
     place = mi.ScalarTransform4f().translate([0, 0, -3])

@@ -6,7 +6,7 @@ with that and as many rays in every pixel as edges get.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -37,6 +37,13 @@ TITLES = {
     "operations": "size of the tracing kernel, operations",
     "launches": "launches of kernels",
     "seconds": "time",
+}
+
+# By measure but for the time: the figure of a render
+FIGURES: dict[str, Callable[[Callable[..., Result]], float]] = {
+    "rays": lambda render: float(sum(render(count_rays=True).rays.values())),
+    "operations": lambda render: float(max(operations(render))),
+    "launches": lambda render: float(render().kernel_launches),
 }
 
 REFINED: Values = {"progress": Progress(), "aa": 4, "aamode": "sobel", "lattice": "report"}
@@ -74,23 +81,16 @@ def measure(number: int, size: tuple[int, int], repeats: int) -> Values:
         GENERAL: partial(mrt.render, whole, **general_way),
         EVERYTHING: partial(mrt.render, whole, **general_way | {"aamode": "none"}),
     }
-    figures = {}
-    for way, render in renders.items():
-        counted = render(count_rays=True)
-        figures[way] = {
-            "rays": float(sum(counted.rays.values())),
-            "operations": float(max(operations(render))),
-            "launches": float(render().kernel_launches),
-        }
+    own = {name: figure(renders[PLANNED]) for name, figure in FIGURES.items()}
+    others = {name: figure(renders[MEASURES[name]]) for name, figure in FIGURES.items()}
 
     def render_by(way: str, turn: int) -> Result:
         return renders[way]()
 
-    turns = timed_in_turns([partial(render_by, way) for way in renders], repeats)
-    for way, (_, seconds) in zip(renders, turns, strict=True):
-        figures[way]["seconds"] = float(np.median(seconds))
-    own = figures[PLANNED]
-    times = {f"{name}: times as many": figures[way][name] / own[name] for name, way in MEASURES.items()}
+    ways = (PLANNED, MEASURES["seconds"])
+    turns = timed_in_turns([partial(render_by, way) for way in ways], repeats)
+    own["seconds"], others["seconds"] = (float(np.median(seconds)) for _, seconds in turns)
+    times = {f"{name}: times as many": others[name] / own[name] for name in MEASURES}
     (result, *_), _ = turns[0]
     left_out = ", ".join(what for what, _ in result.plan.left_out if what not in LAYERS)
     return {"scene": number, **own, **times, "left out": left_out}
