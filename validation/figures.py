@@ -50,7 +50,7 @@ def hard_axes(*, quick: bool = False) -> Drawn:
 
 def left_out(*, quick: bool = False) -> Drawn:
     """What the numbered scenes would cost if nothing were left out, and what each goes without."""
-    scenes, repeats = ((3,), 1) if quick else (needs.SCENES, 5)
+    scenes, repeats = ((3,), 1) if quick else (needs.SCENES, 3)
     return _of_study("savings", findings(needs.show, size=SMALL, scenes=scenes, repeats=repeats))
 
 

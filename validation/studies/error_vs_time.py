@@ -70,8 +70,8 @@ DOCS = Cost(
     lattices=("centered",),
     cold=False,
 )
-# Widths of scenes in the documentation, at which 16 rays in each pixel take 50 ms or more
-WIDTHS: dict[Number, int] = {0: 384, 1: 336, 2: 300, 3: 252, 4: 216}
+# Widths of scenes in the documentation, at which 16 rays in each pixel take some 50 ms
+WIDTHS: dict[Number, int] = {0: 384, 1: 336, 2: 300, 3: 252, 4: 192}
 
 
 def shown(scene: Number) -> Cost:
