@@ -63,7 +63,8 @@ class Pair:
 # A lobe has a name, the parameter that scales it with its default, the flag of its component among
 # ``mi.BSDFFlags`` and the names of the other parameters that it depends on. ``value`` is f cos θo, and
 # ``density`` that of its samples per solid angle; ``sample`` draws a direction, with tan² of the angle of the
-# half vector to z. ``albedo``, how much light from ``at.wi`` it reflects, decides how often it is drawn from
+# half vector to z. ``albedo``, how much light from ``at.wi`` it reflects, decides how often it is drawn from.
+# ``at.given`` has the values of all parameters, by name
 
 
 class Diffuse:
@@ -131,8 +132,8 @@ Lobe = Diffuse | Specular
 # In the order of the components of the BSDF
 LOBES: tuple[Lobe, ...] = (Diffuse(), Specular())
 
-# Parameters that are numbers, or textures of one channel, with their defaults and limits: up to four of them,
-# which is what a row of the table of materials holds
+# Parameters that are numbers, or textures of one channel, with their defaults and limits, as ``number`` takes
+# them: up to four of them, which is what a row of the table of materials holds
 NUMBERS: dict[str, tuple[float, dict[str, float]]] = {
     "alpha": (0.1, {}),
     "int_ior": (1.5, {"above": 0}),
