@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -48,12 +49,20 @@ def picture(scene: mi.Scene, integrator: Any) -> np.ndarray:
     return np.array(mi.render(scene, integrator=integrator, spp=1, seed=1))
 
 
+@pytest.fixture
+def quiet() -> Iterator[None]:
+    """Let Mitsuba print errors alone."""
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    yield
+    mi.set_log_level(level)
+
+
 @pytest.mark.parametrize(
     "part", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.attack)]
 )
-def test_edited_scenes_are_drawn_as_scenes_made_anew(part, variant, tmp_path):
+def test_edited_scenes_are_drawn_as_scenes_made_anew(part, quiet, variant, tmp_path):
     """To the bit, and those made anew in another process."""
-    mi.set_log_level(mi.LogLevel.Error)
     first = 20 + 1000 * part
     count = (2, 14, 72 * ROUNDS)[part]
     path = tmp_path / "anew.npz"
