@@ -24,6 +24,7 @@ def found(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_file_has_a_row_for_each_figure(found):
     run = json.loads(found.read_text())
     assert {"mitsuba", "llvm", "python", "cores"} <= run["machine"].keys()
@@ -56,6 +57,7 @@ def test_both_sides_take_turns(monkeypatch, tmp_path):
     assert rows["small"]["other_seconds"] == rows["small"]["seconds"] > 0
 
 
+@pytest.mark.slow
 def test_comparison_prints_ratios(found, tmp_path, monkeypatch, capsys):
     before = bench.read(found)
     twice = [

@@ -83,7 +83,9 @@ def test_more_than_noise(tmp_path):
     assert min(mrt.compare(*pair).p_value, mrt.compare(*pair[::-1]).p_value) > 0.01
 
 
-@pytest.mark.parametrize(("share", "deviation"), [(0, 0), (0.01, 0), (0, 0.6), (0.0001, 0.6)])
+@pytest.mark.parametrize(
+    ("share", "deviation"), [(0, 0), (0.01, 0), (0, 0.6), pytest.param(0.0001, 0.6, marks=pytest.mark.slow)]
+)
 def test_p_value_is_uniform_for_equal_pictures(share, deviation, tmp_path):
     """Also where a few rays are bright, and most pixels state far too small an error, and under filters
     of a Gaussian of some pixels."""

@@ -83,6 +83,7 @@ def test_make_test_gpu_runs_its_selection_where_it_is_told_to(run_command):
         assert "needs an NVIDIA GPU" in missing.stdout + missing.stderr
 
 
+@pytest.mark.slow
 def test_bench_of_a_device_measures_pairs_in_its_variant(monkeypatch):
     monkeypatch.setattr(bench, "DEVICE_SIZES", [(80, 60)])
     rows = bench.rows(Namespace(device="llvm_ad_spectral", turns=1))

@@ -133,7 +133,7 @@ faults("filters:noise", wrapped(filters, "sobel_edges", lambda f, image, **_: f(
 faults(
     "filters:depth_of_field", wrapped(filters, "gaussian_dof", moved_blur), "corrected / report", slow=True
 )
-faults("error_vs_time", wrong_cases("sampling", {"aa": 4}, {"aa": 1}), "RMSE of none aa=4")
+faults("error_vs_time", wrong_cases("sampling", {"aa": 4}, {"aa": 1}), "RMSE of none aa=4", slow=True)
 faults(
     "error_vs_time", wrong_cases("sampling", {"aamode": "sobel"}, {"aa": 1}), "RMSE of sobel aa=4", slow=True
 )

@@ -74,7 +74,7 @@ Change = tuple[Any, str, Any]  # of a module, or a class: a name and what it bec
 
 def loss(name: str, part: str, *changes: Change, missed: list[str]) -> None:
     """Add changes that lose digits, and the bounds of a part of the study that they must miss."""
-    losses(part, changes, missed, name=name, slow=part == "geometry")
+    losses(part, changes, missed, name=name, slow=part == "geometry" or name == "tan θ")
 
 
 loss("tan θ", "bsdf", (microfacet, "tan2_theta", report_tan2_theta), missed=["D, largest"])

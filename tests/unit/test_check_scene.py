@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cases import but_slow
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
@@ -234,7 +235,7 @@ EMITTERS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", EMITTERS)
+@pytest.mark.parametrize("name", but_slow(EMITTERS, {"sunsky"}))
 def test_emitters_by_themselves(name, tmp_path):
     parameters = dict(EMITTERS[name])
     if name == "envmap":
