@@ -11,7 +11,7 @@ import pytest
 class Cases(list[Any]):
     """The cases of a parametrised test: ``cases(value, ...)`` adds one, named by its values or a ``name``.
 
-    ``slow``: it takes more than about ten seconds.
+    ``slow``: it takes some five seconds or more, and ``make test`` alone runs it.
     """
 
     def __call__(self, *values: Any, name: str | None = None, slow: bool = False) -> None:

@@ -194,7 +194,7 @@ def test_what_others_wrote_in_python_is_asked_each_time(variant, door, what, whe
     loaded = scene(**content)
     render = DOORS[door]
     first = render(loaded)
-    for level in (0.4, 0.0):
+    for level in (0.4, 0.0, 0.3):
         set_level(loaded, where, level)
         changed = render(loaded)
         assert abs(changed - first).max() > 1e-2
