@@ -10,6 +10,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.filters.grid import window_means
+from mrt_mitsuba.interrupts import left_to_other_threads
 from mrt_mitsuba.output.error import tail_shape
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.exposing import Exposer
@@ -44,7 +45,8 @@ def whole_pictures(
     for done in range(0, rays, most):
         count = film.rays_near(min(most, rays - done))
         try:
-            shader.integrator.render(shader.scene, shader.sensor, seed=seed, spp=count)
+            with left_to_other_threads():
+                shader.integrator.render(shader.scene, shader.sensor, seed=seed, spp=count)
         except RuntimeError as error:  # such as a lamp that no ray can start at
             text = " ".join(str(error).split())
             raise SceneError(f"the integrator {shader.name} cannot render this scene: {text}") from error

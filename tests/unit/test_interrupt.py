@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba import interrupts, scene_dict
 from mrt_mitsuba.interrupts import Terminated, ending_soon
 
@@ -116,6 +117,25 @@ def test_mi_render_leaves_no_handler(variant):
         dr.backward(dr.mean(mi.render(scene, params, spp=1)))
         assert np.isfinite(dr.grad(params[key])).all()
         assert handler(signal.SIGINT) == before
+
+
+def test_ctrl_c_is_left_to_other_threads_while_mitsuba_renders(monkeypatch, variant):
+    """Its own handler allocates memory; in the middle of an allocation of this thread, it waited for ever."""
+    masks = []
+    render = mi.AdjointIntegrator.render
+
+    def noted(*args, **given):
+        masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+        return render(*args, **given)
+
+    monkeypatch.setattr(mi.AdjointIntegrator, "render", noted)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    nodes = {"type": "scene", "sensor": {"type": "perspective", "film": film}, "ball": {"type": "sphere"}}
+    nodes["light"] = {"type": "point", "position": [0, 0, 5]}
+    mrt.render(mi.load_dict(nodes), integrator=mi.load_dict({"type": "ptracer"}), spp=4)
+    assert masks == [{signal.SIGINT}]
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before == set()
 
 
 DEAF = """
