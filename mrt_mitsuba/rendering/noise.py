@@ -657,8 +657,8 @@ def _levelled(stated: np.ndarray, measured: np.ndarray, among: np.ndarray) -> np
     counts, edges = np.histogram(logs, LEVELS)
     middles = (edges[1:] + edges[:-1]) / 2
     powers = np.linspace(0.1, 1.5, 29)
-    means = [np.average(middles, weights=counts * np.exp(power * (middles - edges[-1]))) for power in powers]
-    power = np.interp(np.average(logs, weights=weights), means, powers)
+    each = counts * np.exp(np.outer(powers, middles - edges[-1]))  # weights, by power
+    power = np.interp(np.average(logs, weights=weights), each @ middles / each.sum(1), powers)
     levelled = stated ** np.float32(power)
     return np.asarray(levelled * (stated[among].sum() / max(levelled[among].sum(), 1e-30)))
 
@@ -692,12 +692,12 @@ def _factor(
     """
     step = max(1, deviation.size // RANKED)
     every = deviation.ravel()[::step]
-    there = have.ravel()[::step]
+    there = have.ravel()[::step].astype(np.float32)
     total = deviation.sum()
     if total == 0:  # no pixels, or none with noise
         return 0.0
     low = 0.0
-    high = (room + have.sum()) / total
+    high = float((room + have.sum()) / total)
     for _ in range(24):
         factor = (low + high) / 2
         rays = np.maximum(factor * every, there)
