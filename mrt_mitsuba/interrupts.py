@@ -88,24 +88,6 @@ def heed(handlers: dict[int, Callable[..., Any]] = _handlers) -> None:
             handlers[number](number, None)
 
 
-@contextlib.contextmanager
-def left_to_other_threads() -> Iterator[None]:
-    """Let threads other than this one handle Ctrl-C in the block, or this one after it, if there are none.
-
-    A render function of Mitsuba's own sets a handler that allocates memory. It would run in this thread,
-    and if that is allocating memory just then, as it does while it compiles a kernel, it waits for itself
-    forever.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # where signals come in a thread of their own
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:
     """The interrupt that Mitsuba or Dr.Jit turned into an error; None for any other error."""
     cause: BaseException | None = error

@@ -19,6 +19,7 @@ from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, make_plan
 from .parameters import LARGEST, ParameterError, choice, flag, integer, number, spectrum
 from .point_buffer import PointBuffer
 from .scene_data import Hit, SceneData
+from .signals import left_to_other_threads
 from .snapshot import Kept, Snapshot
 from .variants import but_not, construct_quietly, largest
 
@@ -119,15 +120,16 @@ class MrtWhitted(mi.SamplingIntegrator):
         evaluate: bool = True,
     ) -> mi.TensorXf:
         before = self._rendering
-        self._rendering = self.prepare(scene)
-        # Mitsuba calls this under a handler of Ctrl-C that would take itself for the one before it. Only the
-        # main thread may set one, and only one of Python's
-        with contextlib.suppress(ValueError, TypeError):
-            signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT))
-        try:
-            return mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
-        finally:
-            self._rendering = before
+        with left_to_other_threads():
+            self._rendering = self.prepare(scene)
+            # Mitsuba calls this under a handler of Ctrl-C that would take itself for the one before it. Only
+            # the main thread may set one, and only one of Python's
+            with contextlib.suppress(ValueError, TypeError):
+                signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT))
+            try:
+                return mi.SamplingIntegrator.render(self, scene, sensor, seed, spp, develop, evaluate)
+            finally:
+                self._rendering = before
 
     def sample(
         self,

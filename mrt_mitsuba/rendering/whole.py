@@ -10,8 +10,8 @@ import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.filters.grid import window_means
-from mrt_mitsuba.interrupts import left_to_other_threads
 from mrt_mitsuba.output.error import tail_shape
+from mrt_mitsuba.plugins.signals import left_to_other_threads
 from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.exposing import Exposer
 from mrt_mitsuba.rendering.noise import (

@@ -119,22 +119,32 @@ def test_mi_render_leaves_no_handler(variant):
         assert handler(signal.SIGINT) == before
 
 
-def test_ctrl_c_is_left_to_other_threads_while_mitsuba_renders(monkeypatch, variant):
+@pytest.mark.parametrize(
+    ("owner", "integrator", "render"),
+    [("AdjointIntegrator", "ptracer", mrt.render), ("SamplingIntegrator", "mrt_whitted", mi.render)],
+)
+def test_ctrl_c_is_left_to_other_threads_while_mitsuba_renders(
+    owner, integrator, render, monkeypatch, variant
+):
     """Its own handler allocates memory; in the middle of an allocation of this thread, it waited for ever."""
     masks = []
-    render = mi.AdjointIntegrator.render
+    owner = getattr(mi, owner)
+    theirs = owner.render
 
     def noted(*args, **given):
         masks.append(signal.pthread_sigmask(signal.SIG_BLOCK, []))
-        return render(*args, **given)
+        return theirs(*args, **given)
 
-    monkeypatch.setattr(mi.AdjointIntegrator, "render", noted)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
     film = {"type": "hdrfilm", "width": 4, "height": 4}
     nodes = {"type": "scene", "sensor": {"type": "perspective", "film": film}, "ball": {"type": "sphere"}}
     nodes["light"] = {"type": "point", "position": [0, 0, 5]}
-    mrt.render(mi.load_dict(nodes), integrator=mi.load_dict({"type": "ptracer"}), spp=4)
-    assert masks == [{signal.SIGINT}]
+    scene = mi.load_dict(nodes)
+    integrator = mi.load_dict({"type": integrator})
+    monkeypatch.setattr(owner, "render", noted)
+    render(scene, integrator=integrator, spp=4)
+    assert masks
+    assert all(mask == {signal.SIGINT} for mask in masks)
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before == set()
 
 
