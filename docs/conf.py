@@ -56,7 +56,7 @@ def generate(app: object) -> None:
 
 def layers_table() -> str:
     """Return the layers that can be asked for, as a table."""
-    from mrt_mitsuba.output import LAYERS
+    from mrt_mitsuba.files import LAYERS
 
     rows = [
         f"| `{layer.name}` | {layer.letters} | {layer.doc} | {layer.source} |" for layer in LAYERS.values()

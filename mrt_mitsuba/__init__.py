@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from mrt_mitsuba.runtime import register as register
     from mrt_mitsuba.scene.export import scene_dict as scene_dict
     from mrt_mitsuba.sweeps import sweep as sweep
-    from mrt_mitsuba.validation.checks.bsdf import check_bsdf as check_bsdf
-    from mrt_mitsuba.validation.checks.emitter import check_emitter as check_emitter
-    from mrt_mitsuba.validation.checks.scene import check_scene as check_scene
-    from mrt_mitsuba.validation.checks.shape import check_shape as check_shape
+    from mrt_mitsuba.validation.laws.bsdf import check_bsdf as check_bsdf
+    from mrt_mitsuba.validation.laws.emitter import check_emitter as check_emitter
+    from mrt_mitsuba.validation.laws.scene import check_scene as check_scene
+    from mrt_mitsuba.validation.laws.shape import check_shape as check_shape
     from mrt_mitsuba.validation.studies.roughconductor import compare_roughconductor as compare_roughconductor
     from mrt_mitsuba.validation.tools.compare import compare as compare
     from mrt_mitsuba.validation.tools.work_precision import error_vs_time as error_vs_time
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 # Where each public name lives; the module is imported when the name is first used.
 _HOME = {
     "Result": "mrt_mitsuba.rendering.api",
-    "check_bsdf": "mrt_mitsuba.validation.checks.bsdf",
-    "check_emitter": "mrt_mitsuba.validation.checks.emitter",
-    "check_scene": "mrt_mitsuba.validation.checks.scene",
-    "check_shape": "mrt_mitsuba.validation.checks.shape",
+    "check_bsdf": "mrt_mitsuba.validation.laws.bsdf",
+    "check_emitter": "mrt_mitsuba.validation.laws.emitter",
+    "check_scene": "mrt_mitsuba.validation.laws.scene",
+    "check_shape": "mrt_mitsuba.validation.laws.shape",
     "compare": "mrt_mitsuba.validation.tools.compare",
     "compare_roughconductor": "mrt_mitsuba.validation.studies.roughconductor",
     "error_vs_time": "mrt_mitsuba.validation.tools.work_precision",

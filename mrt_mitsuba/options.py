@@ -9,8 +9,8 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
+from mrt_mitsuba.adaptive.target import Target, plain
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.target import Target, plain
 
 Value = TypeVar("Value")
 Values = Mapping[str, Any]  # by the names of options or parameters

@@ -56,8 +56,7 @@ def use(variant: str | None = None) -> str:
             mitsuba_changes.mitsuba_first()
             mitsuba_changes.make()
         plugins.register()
-        plugins.register_modules("mrt_mitsuba.rays", ["samplers"])
-        plugins.register_modules("mrt_mitsuba.rendering", ["adaptive"])
+        plugins.register_modules("mrt_mitsuba.adaptive", ["samplers", "integrator"])
         _used = variant
     return variant
 

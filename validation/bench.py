@@ -22,7 +22,7 @@ from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, UsageError
-from mrt_mitsuba.output.replacing import replacing
+from mrt_mitsuba.files.replacing import replacing
 from mrt_mitsuba.validation.tools import renders
 from mrt_mitsuba.validation.tools.study import in_turns, machine, prepare_folder, ratio, ratio_of
 

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output.files import to_8bit
+from mrt_mitsuba.files.images import to_8bit
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.studies import error_vs_time, needs
 from mrt_mitsuba.validation.studies.honest import by_tenths

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from mrt_mitsuba.output import to_8bit
+from mrt_mitsuba.files import to_8bit
 from mrt_mitsuba.rendering.progress import Progress
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from mrt_mitsuba.command import registry
 from mrt_mitsuba.command.options import parse
 from mrt_mitsuba.errors import MrtError, UsageError, needs_extra, one_line
+from mrt_mitsuba.files.replacing import discard_unfinished
 from mrt_mitsuba.interrupts import Terminated, ending_soon, leave_now
-from mrt_mitsuba.output.replacing import discard_unfinished
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM

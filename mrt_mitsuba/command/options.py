@@ -11,8 +11,8 @@ from typing import Any
 
 from mrt_mitsuba.command.registry import split
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.files.images import TONEMAP
 from mrt_mitsuba.options import SWITCH, Kind, check, choice, either, is_obj, option, table
-from mrt_mitsuba.output.files import TONEMAP
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.report import NUMBERS

@@ -11,10 +11,10 @@ import warnings
 
 from mrt_mitsuba.command.options import LEVELS, Options
 from mrt_mitsuba.errors import MrtWarning, printable
+from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import check_start
 from mrt_mitsuba.options import is_obj
-from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.settings import AA, AAMODE, NOISE
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
 

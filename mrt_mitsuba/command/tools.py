@@ -15,7 +15,7 @@ from mrt_mitsuba import llvm
 from mrt_mitsuba.command.options import TABLE, parse
 from mrt_mitsuba.command.registry import COMMANDS
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError
-from mrt_mitsuba.output.replacing import check_target
+from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.scene.files import require_file
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 

@@ -238,7 +238,7 @@ def contours(*edges: EdgeMap) -> np.ndarray:
 
 def save_contours(path: str | os.PathLike[str], *edges: EdgeMap) -> None:
     """Write ``contours(*edges)`` as .png or .exr; raise ``OutputError`` where that fails."""
-    from mrt_mitsuba.output import save
+    from mrt_mitsuba.files import save
 
     save(path, contours(*edges))
 

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.files import images
+from mrt_mitsuba.files.layers import AVERAGED
+from mrt_mitsuba.files.layers import TABLE as LAYER_TABLE
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import Budget, Workspace
 from mrt_mitsuba.options import Values
-from mrt_mitsuba.output import files
-from mrt_mitsuba.output.layers import AVERAGED
-from mrt_mitsuba.output.layers import TABLE as LAYER_TABLE
 from mrt_mitsuba.rendering.exposing import OWN
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, make_plan
@@ -39,7 +39,7 @@ Image = NDArray[np.float32]
 Options = ParamSpec("Options")
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.output.error import ErrorEstimate, Round
+    from mrt_mitsuba.adaptive.error import ErrorEstimate, Round
 
     class Render(Protocol[Options]):
         """A function of a scene and the options of a render."""
@@ -71,7 +71,7 @@ class Result:
         ``tonemap`` ("report" or "srgb") concerns a PNG only.
         """
         header = self.header()
-        files.save(paths, self.image, layers=self.layers, header=header, tonemap=tonemap, inputs=self.inputs)
+        images.save(paths, self.image, layers=self.layers, header=header, tonemap=tonemap, inputs=self.inputs)
 
     def header(self) -> dict[str, Any]:
         """The header attributes of an EXR: how the picture was made, and nothing such as seconds that changes
@@ -98,7 +98,7 @@ class Result:
 
     def _repr_png_(self) -> bytes:
         """Show the picture in a notebook, in sRGB as screens expect it."""
-        return files.png(self.image)
+        return images.png(self.image)
 
 
 def _with_options(settings: Callable[Options, RenderSettings]) -> Callable[[Any], Render[Options]]:

@@ -19,12 +19,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba.files.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.filters.grid import dilated
 from mrt_mitsuba.interrupts import heed
 from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY
-from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
-from mrt_mitsuba.rays.canvas import Canvas
-from mrt_mitsuba.rays.film import Film, Places, divide, opaque
+from mrt_mitsuba.rendering.canvas import Canvas
+from mrt_mitsuba.rendering.film import Film, Places, divide, opaque
 from mrt_mitsuba.rendering.plan import Pass
 from mrt_mitsuba.rendering.progress import Advance, Job
 from mrt_mitsuba.rendering.settings import FILM
@@ -156,7 +156,7 @@ class FilmStarts:
 
     film: Film
     seed: Any  #: a number, or an array of one
-    sampler: mi.Sampler  #: one of ``rays/samplers.py``
+    sampler: mi.Sampler  #: one of ``adaptive/samplers.py``
 
     def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
         self.sampler.start_in(self.seed, pixel, number)

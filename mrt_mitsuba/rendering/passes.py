@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from mrt_mitsuba import filters
+from mrt_mitsuba.files.layers import TABLE
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
-from mrt_mitsuba.output.layers import TABLE
-from mrt_mitsuba.rays.film import Region
 from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Stack, widened
+from mrt_mitsuba.rendering.film import Region
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
 from mrt_mitsuba.rendering.settings import DETECTORS
 from mrt_mitsuba.rendering.shading import Shader
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.output.error import ErrorEstimate, Round
+    from mrt_mitsuba.adaptive.error import ErrorEstimate, Round
 
 
 class Passes:
@@ -137,8 +137,8 @@ class Passes:
 
     def _run_rounds(self, step: Rounds, exposer: Exposer) -> None:
         """Expose pixels until the noise is as low as was asked for."""
-        from mrt_mitsuba.rendering.noise import Noise, RayNoise
-        from mrt_mitsuba.rendering.rounds import run_rounds
+        from mrt_mitsuba.adaptive.noise import Noise, RayNoise
+        from mrt_mitsuba.adaptive.rounds import run_rounds
         from mrt_mitsuba.rendering.whole import PictureNoise
 
         # glibc keeps freed blocks up to the size of the largest that was freed, in place of clearing fresh

@@ -10,12 +10,13 @@ from typing import Any, ClassVar
 
 import mitsuba as mi
 
+from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.filters import dof, edges
-from mrt_mitsuba.output.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.plugins import kernel_plan
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
-from mrt_mitsuba.rays.film import Film, Places, Region
+from mrt_mitsuba.rendering.film import Film, Places, Region
 from mrt_mitsuba.rendering.settings import (
     AA,
     AAMODE,
@@ -27,7 +28,6 @@ from mrt_mitsuba.rendering.settings import (
 from mrt_mitsuba.rendering.settings import TABLE as OPTIONS
 from mrt_mitsuba.rendering.shading import Shader
 from mrt_mitsuba.scene.open import Source
-from mrt_mitsuba.target import Goal
 
 # Float32 channels of a pixel that its statistics take: of a film, for each band and channel of the
 # integrator's own, and while rounds are shared out

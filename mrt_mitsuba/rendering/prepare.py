@@ -14,9 +14,9 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.plugins.snapshot import Part
-from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
 from mrt_mitsuba.rendering.exposing import Exposer
+from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import opened

@@ -17,7 +17,7 @@ from mrt_mitsuba.interrupts import heed
 from mrt_mitsuba.machine import Budget, Workspace
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.output.error import RoundPicture
+    from mrt_mitsuba.adaptive.error import RoundPicture
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,7 @@ class NotebookProgress(TerminalProgress):
     _picture = ""  # after the last round, as HTML
 
     def round(self, picture: RoundPicture) -> None:
-        from mrt_mitsuba.output.files import png
+        from mrt_mitsuba.files.images import png
 
         encoded = base64.b64encode(png(picture.image)).decode()
         target = "" if picture.target is None else f" (target {picture.target:.2g})"

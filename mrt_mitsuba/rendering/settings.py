@@ -9,7 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from mrt_mitsuba.adaptive.target import Goal, Target
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.files.layers import LAYERS
 from mrt_mitsuba.options import (
     ANGLE,
     ANYTHING,
@@ -30,13 +32,11 @@ from mrt_mitsuba.options import (
     subset,
     table,
 )
-from mrt_mitsuba.output.layers import LAYERS
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.model import CONVENTION, FRESNEL, MODEL_OPTIONS, SIDE, SIZE
-from mrt_mitsuba.target import Goal, Target
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.output.error import RoundPicture
+    from mrt_mitsuba.adaptive.error import RoundPicture
 
 #: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
 #: the order of its arguments; those of the picture can distinguish noise from edges

@@ -11,12 +11,12 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError
-from mrt_mitsuba.output.layers import FIRST_HIT, TABLE
+from mrt_mitsuba.files.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.plugins import is_known, plugin
 from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.plugins.parameters import ParameterError
 from mrt_mitsuba.plugins.variants import ByShape, text_of
-from mrt_mitsuba.rays.film import Film
+from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.scene.open import Source
 
 if TYPE_CHECKING:

@@ -8,13 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.filters.grid import window_means
-from mrt_mitsuba.output.error import tail_shape
-from mrt_mitsuba.plugins.signals import left_to_other_threads
-from mrt_mitsuba.rays.film import Film
-from mrt_mitsuba.rendering.exposing import Exposer
-from mrt_mitsuba.rendering.noise import (
+from mrt_mitsuba.adaptive.error import tail_shape
+from mrt_mitsuba.adaptive.noise import (
     HALVES,
     LUMINANCE,
     MARGIN,
@@ -25,6 +20,11 @@ from mrt_mitsuba.rendering.noise import (
     number_of,
     quarter_squares,
 )
+from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.filters.grid import window_means
+from mrt_mitsuba.plugins.signals import left_to_other_threads
+from mrt_mitsuba.rendering.exposing import Exposer
+from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.rendering.progress import Advance
 
 _STRIDE = 0x9E3779B9  # from one seed to the next: the golden ratio in 32 bits

@@ -11,9 +11,9 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.files.replacing import replacing
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import StrPath, Values, check, choice
-from mrt_mitsuba.output.replacing import replacing
 from mrt_mitsuba.scene.loading import load_file
 from mrt_mitsuba.scene.model import FRESNEL, SIDE, SIZE, Node, Scene
 from mrt_mitsuba.scene.open import in_terms

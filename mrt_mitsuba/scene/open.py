@@ -12,6 +12,7 @@ from typing import Any, SupportsIndex
 
 import mitsuba as mi
 
+from mrt_mitsuba.adaptive.target import Goal, StatesGoal
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import Values, is_obj, is_path
@@ -19,7 +20,6 @@ from mrt_mitsuba.plugins.variants import text_of
 from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.target import Goal, StatesGoal
 
 WIDEST_FILTER = 1024  # pixels: the largest radius of a film's filter
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.errors import OutputError, warn
-from mrt_mitsuba.output.replacing import temporary_folder, unfinished
+from mrt_mitsuba.files.replacing import temporary_folder, unfinished
 
 LOCK = ".mrt-sweep.lock"
 _SCRATCH = ".mrt-sweep-"  # how the names of folders begin that a sweep removes at its end

@@ -20,8 +20,8 @@ import OpenEXR
 from PIL import Image
 
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
-from mrt_mitsuba.output.files import compressing, silenced
-from mrt_mitsuba.output.replacing import replacing
+from mrt_mitsuba.files.images import compressing, silenced
+from mrt_mitsuba.files.replacing import replacing
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.sweeps.folder import Facts

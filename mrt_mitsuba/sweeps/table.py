@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.files.replacing import check_target, replacing
 from mrt_mitsuba.options import Values
-from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.sweeps.folder import Facts
 from mrt_mitsuba.sweeps.jobs import word
 

@@ -14,10 +14,10 @@ from PIL.PngImagePlugin import PngInfo
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, one_line
+from mrt_mitsuba.files.images import save, to_8bit
+from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.machine import memory, usable_cores
 from mrt_mitsuba.options import SMALLEST_MEMORY
-from mrt_mitsuba.output.files import save, to_8bit
-from mrt_mitsuba.output.replacing import check_target
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.sweeps.folder import Facts, read_note, write_note
 from mrt_mitsuba.sweeps.jobs import Job, identify, receive

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 
+from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.filters import luma_edges, sobel_edges
-from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.validation.tools.originals import shortened
 
 DATA = Path(__file__).parent / "data"

@@ -12,7 +12,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.files.images import read_exr
 
 MRT = Path(sys.executable).with_name("mrt")
 TINY = ("width=16", "height=12", "quiet=1", "format=exr")

@@ -15,7 +15,7 @@ from cases import but_slow
 
 from mrt_mitsuba import plugins, render
 from mrt_mitsuba.command import main, options, registry
-from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.validation import cli
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.adaptive.error import tail_shape
 from mrt_mitsuba.machine import Workspace
-from mrt_mitsuba.output.error import tail_shape
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -12,7 +12,7 @@ from nodes import rgb, sensor
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
-from mrt_mitsuba.output.files import write_exr
+from mrt_mitsuba.files.images import write_exr
 from mrt_mitsuba.validation.tools import work_precision
 from mrt_mitsuba.validation.tools.work_precision import Findings, Point
 

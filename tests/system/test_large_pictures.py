@@ -148,7 +148,7 @@ COMMAND = "from mrt_mitsuba.command import main as cli\nsys.exit(cli.main())\n"
 WRITING = """
 import types
 import numpy as np
-from mrt_mitsuba.output import files as output
+from mrt_mitsuba.files import images as output
 class Result:
     def save(self, path, tonemap):
         image = np.random.default_rng(0).random((3000, 4000, 3), np.float32)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays.film import Places
+from mrt_mitsuba.rendering.film import Places
 from mrt_mitsuba.scene.report import report_scene
 
 SMALL = {"width": 96, "height": 72, "focaldist": 0}

@@ -17,8 +17,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
+from mrt_mitsuba.files import read_exr
 from mrt_mitsuba.machine import Workspace
-from mrt_mitsuba.output import read_exr
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.studies import adaptive, honest
 from mrt_mitsuba.validation.tools.compare import averaged

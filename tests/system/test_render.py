@@ -14,7 +14,7 @@ from cases import Cases
 from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output import LAYERS
+from mrt_mitsuba.files import LAYERS
 from mrt_mitsuba.rendering.progress import Progress
 
 SMALL = {"width": 80, "height": 60}

@@ -14,7 +14,7 @@ from clusters import PATIENCE, Cluster
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, OutputError
-from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.rendering.progress import Progress
 
 pytest.importorskip("distributed")

@@ -24,8 +24,8 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
+from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.machine import usable_cores
-from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.rendering.progress import Progress
 
 Client = pytest.importorskip("distributed").Client

@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import filters
-from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation import cli

@@ -12,7 +12,7 @@ from cases import but_slow
 from numpy.testing import assert_allclose
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.checks import probe
+from mrt_mitsuba.validation.laws import probe
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies import bsdf_laws
 from mrt_mitsuba.validation.studies.roughconductor import POINTWISE, compare_pointwise

@@ -16,7 +16,7 @@ from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks.bsdf import LAWS
+from mrt_mitsuba.validation.laws.bsdf import LAWS
 from mrt_mitsuba.validation.studies import power
 
 pytestmark = pytest.mark.usefixtures("variant")

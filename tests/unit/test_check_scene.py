@@ -14,10 +14,10 @@ from cases import but_slow
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
-from mrt_mitsuba.validation.checks import emitter as emitters
-from mrt_mitsuba.validation.checks import scene as checks
-from mrt_mitsuba.validation.checks.examine import Check
-from mrt_mitsuba.validation.checks.faults import put
+from mrt_mitsuba.validation.laws import emitter as emitters
+from mrt_mitsuba.validation.laws import scene as checks
+from mrt_mitsuba.validation.laws.examine import Check
+from mrt_mitsuba.validation.laws.faults import put
 from mrt_mitsuba.validation.studies import power
 from mrt_mitsuba.validation.studies.power import changed_bsdf, changed_sky
 

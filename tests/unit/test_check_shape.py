@@ -14,8 +14,8 @@ from cases import but_slow
 from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.checks.faults import put
-from mrt_mitsuba.validation.checks.shape import LAWS, Case
+from mrt_mitsuba.validation.laws.faults import put
+from mrt_mitsuba.validation.laws.shape import LAWS, Case
 from mrt_mitsuba.validation.studies import power
 from mrt_mitsuba.validation.studies.power import ChangedShape
 

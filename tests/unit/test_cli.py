@@ -147,7 +147,7 @@ IN_A_RENDER = """
 import sys, time, types
 class Result:
     def save(self, path, tonemap):
-        from mrt_mitsuba.output.replacing import replacing
+        from mrt_mitsuba.files.replacing import replacing
         with replacing(path) as (file,):
             file.write(b"half")
             file.flush()

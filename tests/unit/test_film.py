@@ -11,7 +11,7 @@ from nodes import sensor
 from numpy.testing import assert_allclose
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rays.film import Film
+from mrt_mitsuba.rendering.film import Film
 
 pytestmark = pytest.mark.usefixtures("variant")
 

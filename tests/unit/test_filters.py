@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from mrt_mitsuba import UsageError, filters, runtime
+from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.filters import (
     blur_amount,
     edges_image,
@@ -23,7 +24,6 @@ from mrt_mitsuba.filters import (
     luma_edges,
     sobel_edges,
 )
-from mrt_mitsuba.output.files import read_exr
 from mrt_mitsuba.validation.oracles import filters as reference
 
 needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from mrt_mitsuba.validation.checks.bsdf import LAWS
-from mrt_mitsuba.validation.checks.law import Law
+from mrt_mitsuba.validation.laws.bsdf import LAWS
+from mrt_mitsuba.validation.laws.law import Law
 
 
 def weights() -> Law:

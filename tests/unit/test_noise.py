@@ -13,11 +13,11 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output.error import DOUBTFUL, tail_shape
-from mrt_mitsuba.rays.film import Film
-from mrt_mitsuba.rendering.noise import RayNoise, Sums
-from mrt_mitsuba.rendering.rounds import run_rounds
-from mrt_mitsuba.target import Goal, Target
+from mrt_mitsuba.adaptive.error import DOUBTFUL, tail_shape
+from mrt_mitsuba.adaptive.noise import RayNoise, Sums
+from mrt_mitsuba.adaptive.rounds import run_rounds
+from mrt_mitsuba.adaptive.target import Goal, Target
+from mrt_mitsuba.rendering.film import Film
 
 SIDE = 16
 PIXELS = SIDE**2

@@ -11,12 +11,12 @@ from cases import Cases
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mrt_mitsuba.adaptive.target import Target
 from mrt_mitsuba.command import options, tools
 from mrt_mitsuba.command.options import Options, parse
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.output import LAYERS
+from mrt_mitsuba.files import LAYERS
 from mrt_mitsuba.rendering.settings import RenderSettings
-from mrt_mitsuba.target import Target
 
 accepted = Cases()
 accepted("o 3", {"scene": 3})

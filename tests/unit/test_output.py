@@ -22,8 +22,8 @@ from PIL import Image
 import mrt_mitsuba as mrt
 from mrt_mitsuba import interrupts
 from mrt_mitsuba.errors import MrtWarning, OutputError, UsageError
-from mrt_mitsuba.output import files as output
-from mrt_mitsuba.output.replacing import check_target
+from mrt_mitsuba.files import images as output
+from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.report import report_scene
 

@@ -188,7 +188,7 @@ def test_every_option_makes_a_difference(name):
 
 NEW_LAYER = """
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output import layers, read_exr
+from mrt_mitsuba.files import layers, read_exr
 
 row = layers.Layer("tangent", "XYZ", layers.FIRST_HIT, "tangent along u", lambda r: r.si.sh_frame.s)
 layers.TABLE["tangent"] = layers.LAYERS["tangent"] = row

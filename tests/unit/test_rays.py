@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mrt_mitsuba.filters.grid import dilated, window_means
-from mrt_mitsuba.rays.film import divide
 from mrt_mitsuba.rendering.exposing import Groups
+from mrt_mitsuba.rendering.film import divide
 
 LARGEST = 2**32 - 1
 

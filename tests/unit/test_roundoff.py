@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mrt_mitsuba.validation.checks.noise import ALLOWANCE, ROUNDING, measure
+from mrt_mitsuba.validation.laws.noise import ALLOWANCE, ROUNDING, measure
 
 STEP = 2.0**-23  # from one float32 number between 1 and 2 to the next
 COUNT = 400

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks.bsdf import check_bsdf
+from mrt_mitsuba.validation.laws.bsdf import check_bsdf
 from mrt_mitsuba.validation.tools.bsdf_probe import albedo, at_angle, rgb
 from mrt_mitsuba.validation.tools.study import Bound, Study
 

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.output import LAYERS
+from mrt_mitsuba.files import LAYERS
 from mrt_mitsuba.rendering.api import Result
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.tools import diagrams

@@ -11,13 +11,13 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks import bsdf, emitter, shape
-from mrt_mitsuba.validation.checks.bsdf import check_bsdf
-from mrt_mitsuba.validation.checks.emitter import check_emitter
-from mrt_mitsuba.validation.checks.examine import Check
-from mrt_mitsuba.validation.checks.law import Fault, Judge, faults_of
-from mrt_mitsuba.validation.checks.shape import check_shape
-from mrt_mitsuba.validation.checks.subject import Given
+from mrt_mitsuba.validation.laws import bsdf, emitter, shape
+from mrt_mitsuba.validation.laws.bsdf import check_bsdf
+from mrt_mitsuba.validation.laws.emitter import check_emitter
+from mrt_mitsuba.validation.laws.examine import Check
+from mrt_mitsuba.validation.laws.law import Fault, Judge, faults_of
+from mrt_mitsuba.validation.laws.shape import check_shape
+from mrt_mitsuba.validation.laws.subject import Given
 
 Change = tuple[str, Any]  # the kind of change, and the change
 

@@ -15,8 +15,8 @@ from scipy.special import erfc
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.output.files import write_exr
-from mrt_mitsuba.validation.checks.probe import is_scalar
+from mrt_mitsuba.files.images import write_exr
+from mrt_mitsuba.validation.laws.probe import is_scalar
 from mrt_mitsuba.validation.oracles.reference import smith_g1
 from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, lobe_pairs, relative_error
 from mrt_mitsuba.validation.tools.compare import compare, p_values

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, direction, unit
+from mrt_mitsuba.validation.laws.probe import Array, Lanes, Probe, direction, unit
 
 RESOLUTION = 700  # of the quadrature of an albedo, on each axis
 

@@ -41,7 +41,7 @@ def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: s
 
 def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
     """Check a scene; return 0 where every law holds, 1 where one does not."""
-    from mrt_mitsuba.validation.checks.scene import check_scene
+    from mrt_mitsuba.validation.laws.scene import check_scene
 
     settings = {
         "quick": checked("quick", SWITCH, quick, text=True),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mrt_mitsuba.output.files import read_exr
+from mrt_mitsuba.files.images import read_exr
 
 EXACT = 24  # significant bits of a float32
 

@@ -27,9 +27,9 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import OutputError, needs_extra
+from mrt_mitsuba.files.images import png
+from mrt_mitsuba.files.replacing import check_target, replacing
 from mrt_mitsuba.machine import usable_cores
-from mrt_mitsuba.output.files import png
-from mrt_mitsuba.output.replacing import check_target, replacing
 from mrt_mitsuba.rendering.progress import Progress
 
 VALIDATION = "Validation of mrt-mitsuba"

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import filters, runtime
-from mrt_mitsuba.validation.checks.probe import Array, not_finite
+from mrt_mitsuba.validation.laws.probe import Array, not_finite
 from mrt_mitsuba.validation.studies.stability.case import Case
 
 SHAPES = ((1, 1), (1, 17), (17, 1), (2, 2), (3, 3), (1, 2), (40, 30))

@@ -8,11 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.bsdf_case import Case, changed, live, narrow, parameters
-from mrt_mitsuba.validation.checks.faults import GLOSS, of_weight
-from mrt_mitsuba.validation.checks.law import FEWEST, SIGMAS, Law, Skip, figures, finds, most, number_of
-from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
+from mrt_mitsuba.validation.laws import probe
+from mrt_mitsuba.validation.laws.bsdf_case import Case, changed, live, narrow, parameters
+from mrt_mitsuba.validation.laws.faults import GLOSS, of_weight
+from mrt_mitsuba.validation.laws.law import FEWEST, SIGMAS, Law, Skip, figures, finds, most, number_of
+from mrt_mitsuba.validation.laws.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
 IN_THE_MEAN = 5e-2  # where outlines of lobes move, derivatives of samples miss them

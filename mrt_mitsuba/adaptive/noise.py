@@ -22,12 +22,12 @@ from typing import Protocol
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba.adaptive.error import DOUBTFUL, ErrorEstimate, tail_shape
 from mrt_mitsuba.filters.dof import REACH
 from mrt_mitsuba.filters.grid import dilated, window_means
-from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, tail_shape
 from mrt_mitsuba.plugins import plugin
-from mrt_mitsuba.rays.film import Film
 from mrt_mitsuba.rendering.exposing import Exposer, FilmStarts, Groups, Stack, widened
+from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.rendering.progress import Advance
 
 HALVES, SCOUTS = [0, 1], [2, 3]
@@ -290,7 +290,7 @@ class RayNoise:
         self.margin = MARGIN_FILTERED if self.film.reach else MARGIN
         self._exposer = exposer
         self._seed = seed
-        samplers = plugin("samplers", "mrt_mitsuba.rays")
+        samplers = plugin("samplers", "mrt_mitsuba.adaptive")
         self._sampler = mi.load_dict({"type": samplers.ADAPTIVE})
         self._group = self._sampler.group
         self.gain: float = self._sampler.gain

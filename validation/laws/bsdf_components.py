@@ -7,11 +7,11 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, pair_errors, parameters
-from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
-from mrt_mitsuba.validation.checks.faults import larger_by
-from mrt_mitsuba.validation.checks.law import Law, Skip, figures, finds, most, number_of
-from mrt_mitsuba.validation.checks.probe import Array, Lanes, Probe, context, excess
+from mrt_mitsuba.validation.laws.bsdf_case import POINTWISE, Case, pair_errors, parameters
+from mrt_mitsuba.validation.laws.bsdf_snippets import SAMPLE, VALUE
+from mrt_mitsuba.validation.laws.faults import larger_by
+from mrt_mitsuba.validation.laws.law import Law, Skip, figures, finds, most, number_of
+from mrt_mitsuba.validation.laws.probe import Array, Lanes, Probe, context, excess
 
 FLAGS = "print([hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())], hex(int(bsdf.flags())))\n"
 UPDATED = """params = mi.traverse(bsdf)

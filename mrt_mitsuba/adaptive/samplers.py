@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.rays.film import opaque
+from mrt_mitsuba.rendering.film import opaque
 
 # Of adaptive sampling; in scalar variants, where rays are traced one by one, and elsewhere
 ADAPTIVE = "mrt_rays" if mi.variant().startswith("scalar") else "mrt_sequence"

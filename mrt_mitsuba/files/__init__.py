@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mrt_mitsuba.output.files import read_exr, save, to_8bit
-from mrt_mitsuba.output.layers import LAYERS
+from mrt_mitsuba.files.images import read_exr, save, to_8bit
+from mrt_mitsuba.files.layers import LAYERS
 
 __all__ = ["LAYERS", "read_exr", "save", "to_8bit"]

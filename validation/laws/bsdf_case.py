@@ -12,11 +12,11 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.law import Skip
-from mrt_mitsuba.validation.checks.probe import ROUNDED, Array, Lanes, Probe, excess, is_scalar, joined, unit
-from mrt_mitsuba.validation.checks.sphere import DEPTH, POINTS, Cells, encode, integrate
-from mrt_mitsuba.validation.checks.subject import Given, Subject
+from mrt_mitsuba.validation.laws import probe
+from mrt_mitsuba.validation.laws.law import Skip
+from mrt_mitsuba.validation.laws.probe import ROUNDED, Array, Lanes, Probe, excess, is_scalar, joined, unit
+from mrt_mitsuba.validation.laws.sphere import DEPTH, POINTS, Cells, encode, integrate
+from mrt_mitsuba.validation.laws.subject import Given, Subject
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
 QUICK_ANGLES = (0, 50, 85, 140)

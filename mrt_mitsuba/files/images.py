@@ -13,10 +13,10 @@ from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import OutputError, UsageError, warn
+from mrt_mitsuba.files.layers import LAYERS
+from mrt_mitsuba.files.replacing import replacing
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.options import StrPath, Values, check, choice
-from mrt_mitsuba.output.layers import LAYERS
-from mrt_mitsuba.output.replacing import replacing
 
 if TYPE_CHECKING:
     import numpy as np

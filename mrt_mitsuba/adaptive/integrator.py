@@ -10,11 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mrt_mitsuba.adaptive.target import Goal, StatesGoal, Target
 from mrt_mitsuba.errors import warn
 from mrt_mitsuba.plugins.parameters import ParameterError, integer, number
 from mrt_mitsuba.plugins.variants import construct_quietly, text_of
 from mrt_mitsuba.rendering.settings import MAX_SPP
-from mrt_mitsuba.target import Goal, StatesGoal, Target
 
 PARAMETERS = ("target", "max_spp", "max_seconds", "spp")
 FEWEST = 8  # rays of a pixel in the first round
@@ -136,7 +136,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         """
         if self.nested.class_name() != "AOVIntegrator" or not names:
             return picture
-        from mrt_mitsuba.rendering.noise import LUMINANCE
+        from mrt_mitsuba.adaptive.noise import LUMINANCE
 
         film, further = np.split(np.array(picture), [picture.shape[2] - len(names)], axis=2)
         shown = list[np.ndarray]()

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mrt_mitsuba.validation.checks.probe import Lanes
+from mrt_mitsuba.validation.laws.probe import Lanes
 from mrt_mitsuba.validation.tools.study import Bound
 
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mrt_mitsuba.validation.checks import shape_hits, shape_samples
-from mrt_mitsuba.validation.checks.examine import TIMEOUT, Check, examine
-from mrt_mitsuba.validation.checks.law import laws_in
-from mrt_mitsuba.validation.checks.shape_case import Case
-from mrt_mitsuba.validation.checks.subject import Given
+from mrt_mitsuba.validation.laws import shape_hits, shape_samples
+from mrt_mitsuba.validation.laws.examine import TIMEOUT, Check, examine
+from mrt_mitsuba.validation.laws.law import laws_in
+from mrt_mitsuba.validation.laws.shape_case import Case
+from mrt_mitsuba.validation.laws.subject import Given
 
 LAWS = laws_in(shape_hits, shape_samples)
 

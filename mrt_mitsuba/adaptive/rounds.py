@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from mrt_mitsuba.adaptive.error import DOUBTFUL, ErrorEstimate, Round, RoundPicture
+from mrt_mitsuba.adaptive.noise import estimate
+from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import warn
-from mrt_mitsuba.output.error import DOUBTFUL, ErrorEstimate, Round, RoundPicture
-from mrt_mitsuba.rendering.noise import estimate
 from mrt_mitsuba.rendering.progress import Advance
-from mrt_mitsuba.target import Goal
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.rendering.noise import Forecast, Noise, State
+    from mrt_mitsuba.adaptive.noise import Forecast, Noise, State
 
 log = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.linalg import norm
 from scipy.linalg import null_space
 
-from mrt_mitsuba.validation.checks.faults import larger, member, off_surface, put, smaller, tilted
-from mrt_mitsuba.validation.checks.law import (
+from mrt_mitsuba.validation.laws.faults import larger, member, off_surface, put, smaller, tilted
+from mrt_mitsuba.validation.laws.law import (
     SIGMAS,
     Figure,
     Law,
@@ -21,14 +21,14 @@ from mrt_mitsuba.validation.checks.law import (
     rare,
     share_of,
 )
-from mrt_mitsuba.validation.checks.noise import ROUNDING
-from mrt_mitsuba.validation.checks.probe import (
+from mrt_mitsuba.validation.laws.noise import ROUNDING
+from mrt_mitsuba.validation.laws.probe import (
     Array,
     Lanes,
     lanes,
     unit,
 )
-from mrt_mitsuba.validation.checks.shape_case import (
+from mrt_mitsuba.validation.laws.shape_case import (
     HIT_ROUNDINGS,
     RAY,
     Case,

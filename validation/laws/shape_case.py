@@ -10,10 +10,10 @@ import numpy as np
 from numpy.linalg import norm
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks import subject
-from mrt_mitsuba.validation.checks.law import FEWEST, Skip
-from mrt_mitsuba.validation.checks.noise import ROUNDING
-from mrt_mitsuba.validation.checks.probe import (
+from mrt_mitsuba.validation.laws import subject
+from mrt_mitsuba.validation.laws.law import FEWEST, Skip
+from mrt_mitsuba.validation.laws.noise import ROUNDING
+from mrt_mitsuba.validation.laws.probe import (
     Array,
     Lanes,
     corners,
@@ -21,7 +21,7 @@ from mrt_mitsuba.validation.checks.probe import (
     named,
     unit,
 )
-from mrt_mitsuba.validation.checks.subject import Given, Subject
+from mrt_mitsuba.validation.laws.subject import Given, Subject
 
 OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
 FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.linalg import norm
 from scipy import stats
 
-from mrt_mitsuba.validation.checks import noise, subject
-from mrt_mitsuba.validation.checks.faults import SIZE, larger, member, off_surface, put, tilted
-from mrt_mitsuba.validation.checks.law import (
+from mrt_mitsuba.validation.laws import noise, subject
+from mrt_mitsuba.validation.laws.faults import SIZE, larger, member, off_surface, put, tilted
+from mrt_mitsuba.validation.laws.law import (
     FEWEST,
     LEVEL,
     Figure,
@@ -26,8 +26,8 @@ from mrt_mitsuba.validation.checks.law import (
     number_of,
     share_of,
 )
-from mrt_mitsuba.validation.checks.noise import ROUNDING
-from mrt_mitsuba.validation.checks.probe import (
+from mrt_mitsuba.validation.laws.noise import ROUNDING
+from mrt_mitsuba.validation.laws.probe import (
     Array,
     Lanes,
     corners,
@@ -35,7 +35,7 @@ from mrt_mitsuba.validation.checks.probe import (
     not_finite,
     unit,
 )
-from mrt_mitsuba.validation.checks.shape_case import (
+from mrt_mitsuba.validation.laws.shape_case import (
     FAR,
     FLAT,
     HIT_ROUNDINGS,

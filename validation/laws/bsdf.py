@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mrt_mitsuba.validation.checks import bsdf_components, bsdf_gradients, bsdf_samples, bsdf_values
-from mrt_mitsuba.validation.checks.bsdf_case import Case
-from mrt_mitsuba.validation.checks.examine import TIMEOUT, Check, examine
-from mrt_mitsuba.validation.checks.law import laws_in
-from mrt_mitsuba.validation.checks.subject import Given
+from mrt_mitsuba.validation.laws import bsdf_components, bsdf_gradients, bsdf_samples, bsdf_values
+from mrt_mitsuba.validation.laws.bsdf_case import Case
+from mrt_mitsuba.validation.laws.examine import TIMEOUT, Check, examine
+from mrt_mitsuba.validation.laws.law import laws_in
+from mrt_mitsuba.validation.laws.subject import Given
 
 LAWS = laws_in(bsdf_samples, bsdf_values, bsdf_gradients, bsdf_components)
 

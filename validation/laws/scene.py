@@ -17,12 +17,12 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import Source, open_scene
-from mrt_mitsuba.validation.checks.bsdf import check_bsdf
-from mrt_mitsuba.validation.checks.emitter import check_emitter
-from mrt_mitsuba.validation.checks.examine import Check
-from mrt_mitsuba.validation.checks.probe import not_finite
-from mrt_mitsuba.validation.checks.shape import check_shape
-from mrt_mitsuba.validation.checks.subject import class_name
+from mrt_mitsuba.validation.laws.bsdf import check_bsdf
+from mrt_mitsuba.validation.laws.emitter import check_emitter
+from mrt_mitsuba.validation.laws.examine import Check
+from mrt_mitsuba.validation.laws.probe import not_finite
+from mrt_mitsuba.validation.laws.shape import check_shape
+from mrt_mitsuba.validation.laws.subject import class_name
 from mrt_mitsuba.validation.tools.study import Study, save_report
 
 ALIKE = 6  # of one kind of plugin, so many are checked, spread over all

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mrt_mitsuba.validation.checks.probe import Array, Function, Lanes
+from mrt_mitsuba.validation.laws.probe import Array, Function, Lanes
 
 ROUNDING = 2.0**-24
 ALLOWANCE = 8.0  # roundings that a formula of some dozen operations may make of its own

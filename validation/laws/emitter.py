@@ -13,10 +13,10 @@ from numpy.linalg import norm
 from scipy import stats
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.examine import TIMEOUT, Check, examine
-from mrt_mitsuba.validation.checks.faults import DEGREE, PLACE, larger, no_number, put
-from mrt_mitsuba.validation.checks.law import (
+from mrt_mitsuba.validation.laws import probe
+from mrt_mitsuba.validation.laws.examine import TIMEOUT, Check, examine
+from mrt_mitsuba.validation.laws.faults import DEGREE, PLACE, larger, no_number, put
+from mrt_mitsuba.validation.laws.law import (
     LEVEL,
     Law,
     Skip,
@@ -27,8 +27,8 @@ from mrt_mitsuba.validation.checks.law import (
     number_of,
     rare,
 )
-from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, excess, lanes
-from mrt_mitsuba.validation.checks.sphere import (
+from mrt_mitsuba.validation.laws.probe import BEYOND, Array, Lanes, excess, lanes
+from mrt_mitsuba.validation.laws.sphere import (
     SMALL,
     Cells,
     chances_of,
@@ -38,7 +38,7 @@ from mrt_mitsuba.validation.checks.sphere import (
     integrate,
     least_of,
 )
-from mrt_mitsuba.validation.checks.subject import Given, Subject, judge_many
+from mrt_mitsuba.validation.laws.subject import Given, Subject, judge_many
 from mrt_mitsuba.validation.tools.compare import sidak
 
 SAME = 1e-3  # relative: the same formula, evaluated once more

@@ -14,8 +14,8 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.scene.loading import load_dict
-from mrt_mitsuba.validation.checks.law import Description, Found, Law, Skip
-from mrt_mitsuba.validation.checks.probe import Array, Lanes, is_scalar, unit
+from mrt_mitsuba.validation.laws.law import Description, Found, Law, Skip
+from mrt_mitsuba.validation.laws.probe import Array, Lanes, is_scalar, unit
 
 Given = Any  # such a dict, a value of one, or a loaded plugin
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each

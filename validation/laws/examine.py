@@ -19,8 +19,8 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.checks.law import Judge, Law, Part, Skip
-from mrt_mitsuba.validation.checks.subject import Given, Subject
+from mrt_mitsuba.validation.laws.law import Judge, Law, Part, Skip
+from mrt_mitsuba.validation.laws.subject import Given, Subject
 from mrt_mitsuba.validation.tools.study import Study, notebook, save_report
 
 TITLE = "Laws of plugins"

@@ -7,10 +7,10 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-from mrt_mitsuba.validation.checks import probe
-from mrt_mitsuba.validation.checks.bsdf_case import FIT, POINTWISE, Case, View, live, narrow
-from mrt_mitsuba.validation.checks.bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
-from mrt_mitsuba.validation.checks.faults import (
+from mrt_mitsuba.validation.laws import probe
+from mrt_mitsuba.validation.laws.bsdf_case import FIT, POINTWISE, Case, View, live, narrow
+from mrt_mitsuba.validation.laws.bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
+from mrt_mitsuba.validation.laws.faults import (
     DEGREE,
     PLACE,
     larger,
@@ -21,7 +21,7 @@ from mrt_mitsuba.validation.checks.faults import (
     put,
     smaller,
 )
-from mrt_mitsuba.validation.checks.law import (
+from mrt_mitsuba.validation.laws.law import (
     FEWEST,
     SIGMAS,
     Law,
@@ -32,8 +32,8 @@ from mrt_mitsuba.validation.checks.law import (
     rare,
     share_of,
 )
-from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
-from mrt_mitsuba.validation.checks.sphere import (
+from mrt_mitsuba.validation.laws.probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
+from mrt_mitsuba.validation.laws.sphere import (
     SMALL,
     Cells,
     chi_square,

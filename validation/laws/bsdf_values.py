@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.checks import noise, probe
-from mrt_mitsuba.validation.checks.bsdf_case import POINTWISE, Case, changed, parameters
-from mrt_mitsuba.validation.checks.bsdf_snippets import SAMPLE, VALUE
-from mrt_mitsuba.validation.checks.faults import (
+from mrt_mitsuba.validation.laws import noise, probe
+from mrt_mitsuba.validation.laws.bsdf_case import POINTWISE, Case, changed, parameters
+from mrt_mitsuba.validation.laws.bsdf_snippets import SAMPLE, VALUE
+from mrt_mitsuba.validation.laws.faults import (
     GLASS,
     GLOSS,
     larger,
@@ -23,7 +23,7 @@ from mrt_mitsuba.validation.checks.faults import (
     of_weight,
     put,
 )
-from mrt_mitsuba.validation.checks.law import (
+from mrt_mitsuba.validation.laws.law import (
     FEWEST,
     Figure,
     Law,
@@ -34,8 +34,8 @@ from mrt_mitsuba.validation.checks.law import (
     most,
     number_of,
 )
-from mrt_mitsuba.validation.checks.probe import BEYOND, Array, Lanes, context, excess, is_scalar, unit
-from mrt_mitsuba.validation.checks.subject import judge_many
+from mrt_mitsuba.validation.laws.probe import BEYOND, Array, Lanes, context, excess, is_scalar, unit
+from mrt_mitsuba.validation.laws.subject import judge_many
 
 TWO_WAYS = "two ways to the same number"
 

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.rays.film import Film, divide, opaque
+from mrt_mitsuba.rendering.film import Film, divide, opaque
 
 PIXELS_AT_ONCE = 2**15  # whose sums are formed at once; those of more would not stay in a cache
 OFFSETS_AT_ONCE = 5  # along an axis: a kernel adds rays up for so many pixels next to each other

@@ -1,0 +1,1 @@
+"""Adaptive sampling to an error target: samplers, estimation of the error, allocation of samples, rounds."""
