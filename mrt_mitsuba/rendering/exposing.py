@@ -27,6 +27,7 @@ from mrt_mitsuba.rendering.canvas import Canvas
 from mrt_mitsuba.rendering.film import Film, Places, divide, opaque
 from mrt_mitsuba.rendering.plan import Pass
 from mrt_mitsuba.rendering.progress import Advance, Job
+from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.rendering.settings import FILM
 from mrt_mitsuba.rendering.shading import RayValues, Shader
 
@@ -181,7 +182,7 @@ class SceneStarts:
             sampler = self.film.sensor.sampler().clone()
             sampler.set_sample_count(self.rays)
             sampler.set_samples_per_wavefront(self.rays)
-            sampler.seed((self.seed + before) % 2**32, dr.width(pixel))
+            sampler.seed(derived_seed(self.seed, wavefront=before), dr.width(pixel))
         return Start(*self.film.place(pixel, sampler), None, sampler)
 
 

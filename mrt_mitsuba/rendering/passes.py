@@ -20,6 +20,7 @@ from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Stack, widened
 from mrt_mitsuba.rendering.film import Region
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
+from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.rendering.settings import DETECTORS
 from mrt_mitsuba.rendering.shading import Shader
 
@@ -41,7 +42,7 @@ class Passes:
         self._shader = shader
         self._plan = plan
         self._frame = frame
-        self._seed = plan.seed + 2 * frame  # two passes in a frame, each with random numbers of its own
+        self._seed = derived_seed(plan.seed, frame=frame)
         self._seen = plan.seen.inside(Region(0, 0, plan.width, plan.height))
         self.layers: dict[str, np.ndarray] = {}
         self.error: ErrorEstimate | None = None
@@ -86,7 +87,7 @@ class Passes:
         seed = self._seed
         if isinstance(step, Refinement):
             edge = np.flatnonzero(self.layers["samples"] > 1).astype(np.uint32)
-            seed += 1
+            seed = derived_seed(plan.seed, frame=self._frame, refinement=1)
         if edge is not None or seen.width != width:
             inside = np.arange(count, dtype=np.uint32) if edge is None else edge
             row, column = np.divmod(inside, np.uint32(seen.width))
@@ -110,7 +111,7 @@ class Passes:
             marked[self._seen] = True
         else:
             marked[self._seen] = self.layers["samples"][..., 0] > 1
-            seed += 1
+            seed = derived_seed(plan.seed, frame=self._frame, refinement=1)
         chosen = np.pad(marked, film.border).reshape(1, -1)
         pixels = np.flatnonzero(widened(film, chosen)[0])
         starts = exposer.starts(step.places, seed)

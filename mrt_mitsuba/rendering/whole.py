@@ -26,8 +26,7 @@ from mrt_mitsuba.plugins.signals import left_to_other_threads
 from mrt_mitsuba.rendering.exposing import Exposer
 from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.rendering.progress import Advance
-
-_STRIDE = 0x9E3779B9  # from one seed to the next: the golden ratio in 32 bits
+from mrt_mitsuba.rendering.seeds import derived_seed
 
 
 def whole_pictures(
@@ -46,7 +45,8 @@ def whole_pictures(
         count = film.rays_near(min(most, rays - done))
         try:
             with left_to_other_threads():
-                shader.integrator.render(shader.scene, shader.sensor, seed=seed, spp=count)
+                part = derived_seed(seed, wavefront=done)
+                shader.integrator.render(shader.scene, shader.sensor, seed=part, spp=count)
         except RuntimeError as error:  # such as a lamp that no ray can start at
             text = " ".join(str(error).split())
             raise SceneError(f"the integrator {shader.name} cannot render this scene: {text}") from error
@@ -57,7 +57,6 @@ def whole_pictures(
         if film.grey:
             found[..., :3] = (found[..., :3] @ LUMINANCE)[..., None]
         yield count, found
-        seed = (seed + _STRIDE) % 2**32
         advance(count * film.pixels)
         job.rays["primary"] += count * film.pixels
 
@@ -97,7 +96,7 @@ class PictureNoise:
         total = state.total.copy()
         sums = state.halves.sums.copy()
         for picture, number in enumerate(chosen[:, 0]):
-            seed = (self._seed + _STRIDE * (4 * state.exposures + picture)) % 2**32
+            seed = derived_seed(self._seed, round=state.exposures, picture=picture)
             for count, found in whole_pictures(self._exposer, seed, int(number), advance):
                 values = np.moveaxis(np.pad(count * found, [*border, (0, 0)]), -1, 0)
                 rays[picture] += count
