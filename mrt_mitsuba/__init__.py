@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from mrt_mitsuba.validation.laws.scene import check_scene as check_scene
     from mrt_mitsuba.validation.laws.shape import check_shape as check_shape
     from mrt_mitsuba.validation.studies.roughconductor import compare_roughconductor as compare_roughconductor
-    from mrt_mitsuba.validation.tools.compare import compare as compare
-    from mrt_mitsuba.validation.tools.work_precision import error_vs_time as error_vs_time
+    from mrt_mitsuba.validation.compare import compare as compare
+    from mrt_mitsuba.validation.work_precision import error_vs_time as error_vs_time
 
 # Where each public name lives; the module is imported when the name is first used.
 _HOME = {
@@ -37,9 +37,9 @@ _HOME = {
     "check_emitter": "mrt_mitsuba.validation.laws.emitter",
     "check_scene": "mrt_mitsuba.validation.laws.scene",
     "check_shape": "mrt_mitsuba.validation.laws.shape",
-    "compare": "mrt_mitsuba.validation.tools.compare",
+    "compare": "mrt_mitsuba.validation.compare",
     "compare_roughconductor": "mrt_mitsuba.validation.studies.roughconductor",
-    "error_vs_time": "mrt_mitsuba.validation.tools.work_precision",
+    "error_vs_time": "mrt_mitsuba.validation.work_precision",
     "filters": "mrt_mitsuba.filters",
     "prepare": "mrt_mitsuba.rendering.prepare",
     "register": "mrt_mitsuba.runtime",

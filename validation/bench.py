@@ -23,8 +23,8 @@ from typing import Any
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, UsageError
 from mrt_mitsuba.files.replacing import replacing
-from mrt_mitsuba.validation.tools import renders
-from mrt_mitsuba.validation.tools.study import in_turns, machine, prepare_folder, ratio, ratio_of
+from mrt_mitsuba.validation import renders
+from mrt_mitsuba.validation.study import in_turns, machine, prepare_folder, ratio, ratio_of
 
 START_GOAL = 1.7
 DEVICE_SIZES = (800, 600), (4096, 4096)

@@ -80,7 +80,7 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
     import drjit as dr
 
     from mrt_mitsuba import runtime
-    from mrt_mitsuba.validation.tools.study import Study, prepare_folder, save_report, terminal_table
+    from mrt_mitsuba.validation.study import Study, prepare_folder, save_report, terminal_table
 
     prepare_folder(out)
     seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)

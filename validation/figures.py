@@ -17,11 +17,11 @@ from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.studies import error_vs_time, needs
 from mrt_mitsuba.validation.studies.honest import by_tenths
 from mrt_mitsuba.validation.studies.stability import curves
-from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.compare import averaged
-from mrt_mitsuba.validation.tools.originals import read_original
-from mrt_mitsuba.validation.tools.study import Study, findings
-from mrt_mitsuba.validation.tools.work_precision import Findings
+from mrt_mitsuba.validation import plotting
+from mrt_mitsuba.validation.compare import averaged
+from mrt_mitsuba.validation.originals import read_original
+from mrt_mitsuba.validation.study import Study, findings
+from mrt_mitsuba.validation.work_precision import Findings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,7 +39,7 @@ def error_against_time(*scenes: error_vs_time.Number, quick: bool = False) -> Dr
     for scene in scenes:
         cost = replace(error_vs_time.QUICK, cold=False) if quick else error_vs_time.shown(scene)
         panels |= error_vs_time.choices(scene, cost)
-    drawn = [diagrams.work_precision(title, found) for title, found in panels.items()]
+    drawn = [plotting.work_precision(title, found) for title, found in panels.items()]
     return drawn, error_vs_time.advice(panels)
 
 
@@ -65,7 +65,7 @@ def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
 
     ``folder``: of the pictures ``sN_none_aa4.exr``, whole or shortened.
     """
-    drawn, plots = diagrams.figure(5, 3, 7.2, 9.4)
+    drawn, plots = plotting.figure(5, 3, 7.2, 9.4)
     rows: Rows = []
     for scene, row in enumerate(plots):
         original = read_original(Path(folder) / f"s{scene}_none_aa4.exr")
@@ -84,7 +84,7 @@ def beside_the_original(folder: str | os.PathLike[str]) -> Drawn:
             }
         )
     for axes, title in zip(plots[0], ("original", "ours", "|difference| × 100"), strict=True):
-        axes.set_title(title, loc="left", **diagrams.WORDS)
+        axes.set_title(title, loc="left", **plotting.WORDS)
     return [drawn], rows
 
 
@@ -104,7 +104,7 @@ def maps(result: mrt.Result) -> list[Figure]:
     height, width = result.image.shape[:2]
     figures = []
     for layer, title in MAPS.items():
-        drawn, axes = diagrams.panel(title, 4.6, 4.6 * height / width + 0.8)
+        drawn, axes = plotting.panel(title, 4.6, 4.6 * height / width + 0.8)
         show_map(axes, result.layers[layer])
         figures.append(drawn)
     return figures
@@ -115,7 +115,7 @@ def show_map(axes: Any, values: np.ndarray) -> None:
     least, most = np.quantile(values[values > 0], (0.05, 1))
     shown = axes.imshow(np.maximum(values, least), cmap="viridis", norm="log", vmin=least, vmax=most)
     bar = axes.figure.colorbar(shown, ax=axes, location="bottom", fraction=0.05, pad=0.02)
-    diagrams.plain_numbers(bar.ax.xaxis)
+    plotting.plain_numbers(bar.ax.xaxis)
     _unframe(axes)
 
 
@@ -140,17 +140,17 @@ def tenths(scene: Any, *, seeds: int, truth_spp: int, spp: int = 64) -> tuple[np
 def stated_and_true(scenes: Mapping[str, Any], *, seeds: int = 8, truth_spp: int = 2048) -> Figure:
     """A plot of the true over the stated error of tenths of the pixels, a line for each loaded scene."""
     found = {name: tenths(scene, seeds=seeds, truth_spp=truth_spp) for name, scene in scenes.items()}
-    drawn, axes = diagrams.panel("tenths of the pixels, sorted by stated error", 4.6, 4.0)
+    drawn, axes = plotting.panel("tenths of the pixels, sorted by stated error", 4.6, 4.0)
     ends = {}
-    for (name, (stated, true)), color in zip(found.items(), diagrams.COLORS, strict=False):
+    for (name, (stated, true)), color in zip(found.items(), plotting.COLORS, strict=False):
         axes.plot(stated, true, marker="o", markersize=4, color=color)
         ends[name] = (stated[-1], true[-1], color)
     values = np.concatenate([np.ravel(lines) for lines in found.values()])
     span = np.array([values.min() / 1.3, values.max() * 1.3])
-    axes.plot(span, span, color=diagrams.TEXT, linewidth=0.8)
+    axes.plot(span, span, color=plotting.TEXT, linewidth=0.8)
     axes.fill_between(span, span / 3, span * 3, color="0.93", zorder=0)
     axes.set(xscale="log", yscale="log", xlim=span, ylim=span, xlabel="stated error", ylabel="true error")
-    diagrams.plain_numbers(axes.xaxis, axes.yaxis)
-    diagrams.note(axes, 0.03, 0.97, "grey: within a factor of 3", va="top")
-    diagrams.label_ends(axes, ends)
+    plotting.plain_numbers(axes.xaxis, axes.yaxis)
+    plotting.note(axes, 0.03, 0.97, "grey: within a factor of 3", va="top")
+    plotting.label_ends(axes, ends)
     return drawn

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import matte
-from mrt_mitsuba.validation.tools.bsdf_probe import (
+from mrt_mitsuba.validation.bsdf_probe import (
     albedo,
     at_angle,
     evaluate,

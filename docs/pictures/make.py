@@ -24,7 +24,7 @@ import mitsuba as mi
 
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation import figures
-from mrt_mitsuba.validation.tools import diagrams
+from mrt_mitsuba.validation import plotting
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -99,14 +99,14 @@ def equal_time(quick: bool) -> Image.Image:
         image, took = theirs(spp, seed)
         spp = max(round(spp * seconds / took), 1)
     truth = np.mean([theirs(truth_spp // 8, 100 + k)[0] for k in range(8)], axis=0)
-    drawn, plots = diagrams.figure(1, 4, 10.4, 3.3)
+    drawn, plots = plotting.figure(1, 4, 10.4, 3.3)
     for axes, name, picture in zip(plots[0], ("mi.render", "ours"), (image, result.image), strict=False):
         figures.show_picture(axes, picture, "srgb")
         rmse = np.sqrt(np.square(picture - truth).mean())
-        axes.set_title(f"{name}: {seconds:.2f} s, error {rmse:.3f}", loc="left", **diagrams.WORDS)
+        axes.set_title(f"{name}: {seconds:.2f} s, error {rmse:.3f}", loc="left", **plotting.WORDS)
     for axes, title, layer in zip(plots[0, 2:], figures.MAPS.values(), figures.MAPS, strict=True):
         figures.show_map(axes, result.layers[layer])
-        axes.set_title(title, loc="left", **diagrams.WORDS)
+        axes.set_title(title, loc="left", **plotting.WORDS)
     return rasterized(drawn)
 
 

@@ -12,7 +12,7 @@ from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.machine import check_start
 
 TOOLS = "mrt_mitsuba.command.tools"
-CHECKS = "mrt_mitsuba.validation.tools.commands"
+CHECKS = "mrt_mitsuba.validation.commands"
 
 
 class Command(NamedTuple):

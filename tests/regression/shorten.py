@@ -13,7 +13,7 @@ import OpenEXR
 
 from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.filters import luma_edges, sobel_edges
-from mrt_mitsuba.validation.tools.originals import shortened
+from mrt_mitsuba.validation.originals import shortened
 
 DATA = Path(__file__).parent / "data"
 WHOLE, WIDTH, HEIGHT = (0, 0, 320, 240), 56, 36

@@ -13,7 +13,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.filters import luma_edges, sobel_edges
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import reference_render
-from mrt_mitsuba.validation.tools.originals import Original, read_original
+from mrt_mitsuba.validation.originals import Original, read_original
 
 # Mean absolute difference, and share of pixels off by more than 1/255, without detector or blur. Ours are off
 # at the borders of shadows, where the original's rays start a fixed distance off the surface and speckle

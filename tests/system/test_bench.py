@@ -10,7 +10,7 @@ import pytest
 
 from mrt_mitsuba.validation import bench
 from mrt_mitsuba.validation.studies import speed
-from mrt_mitsuba.validation.tools import renders
+from mrt_mitsuba.validation import renders
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from scipy import ndimage, stats
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
 from mrt_mitsuba.files.images import read_exr, write_exr
-from mrt_mitsuba.validation.tools.compare import p_values
+from mrt_mitsuba.validation.compare import p_values
 
 pytest.importorskip("flip_evaluator")
 

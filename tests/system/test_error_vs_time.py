@@ -13,8 +13,8 @@ from nodes import rgb, sensor
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
 from mrt_mitsuba.files.images import write_exr
-from mrt_mitsuba.validation.tools import work_precision
-from mrt_mitsuba.validation.tools.work_precision import Findings, Point
+from mrt_mitsuba.validation import work_precision
+from mrt_mitsuba.validation.work_precision import Findings, Point
 
 for needed in ("matplotlib", "jinja2", "scipy", "flip_evaluator"):
     pytest.importorskip(needed)

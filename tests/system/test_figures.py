@@ -14,10 +14,10 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.validation import figures
 from mrt_mitsuba.validation.studies import error_vs_time, needs
 from mrt_mitsuba.validation.studies.stability import curves
-from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.compare import compare
-from mrt_mitsuba.validation.tools.study import findings
-from mrt_mitsuba.validation.tools.work_precision import Findings, Point
+from mrt_mitsuba.validation import plotting
+from mrt_mitsuba.validation.compare import compare
+from mrt_mitsuba.validation.study import findings
+from mrt_mitsuba.validation.work_precision import Findings, Point
 
 pytestmark = pytest.mark.usefixtures("variant")
 DATA = Path(__file__).parents[1] / "regression" / "data"
@@ -41,7 +41,7 @@ def found() -> Findings:
 
 
 def test_the_frontier_is_what_nothing_else_beats(found):
-    best = [p.name for p in diagrams.frontier(list(found.points.values()))]
+    best = [p.name for p in plotting.frontier(list(found.points.values()))]
     assert best == ["fast 1", "sure aa=1", "fast 4", "sure aa=4"]
 
 
@@ -56,7 +56,7 @@ def test_advice_names_the_soonest_and_the_next_curve(found):
 
 
 def test_labels_stand_apart(found):
-    drawn = diagrams.work_precision("one", found)
+    drawn = plotting.work_precision("one", found)
     drawn.draw_without_rendering()
     axes = drawn.axes[0]
     labels = [text for text in axes.texts if text.get_text() in ("fast", "sure", "slow")]
@@ -69,9 +69,9 @@ def test_labels_stand_apart(found):
 
 
 def test_places_move_apart_no_more_than_they_must():
-    places = diagrams.apart([0.1, 0.5, 0.51, 0.52, 0.9], 0.1)
+    places = plotting.apart([0.1, 0.5, 0.51, 0.52, 0.9], 0.1)
     np.testing.assert_allclose(places, [0.1, 0.41, 0.51, 0.61, 0.9])
-    crowded = diagrams.apart([0.97, 0.98, 0.99], 0.1)
+    crowded = plotting.apart([0.97, 0.98, 0.99], 0.1)
     np.testing.assert_allclose(crowded, [0.8, 0.9, 1.0])
 
 

@@ -21,9 +21,9 @@ from mrt_mitsuba.files import read_exr
 from mrt_mitsuba.machine import Workspace
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.studies import adaptive, honest
-from mrt_mitsuba.validation.tools.compare import averaged
-from mrt_mitsuba.validation.tools.scenery import SCENES, SPP, load, load_kind, sensor
-from mrt_mitsuba.validation.tools.study import findings
+from mrt_mitsuba.validation.compare import averaged
+from mrt_mitsuba.validation.scenery import SCENES, SPP, load, load_kind, sensor
+from mrt_mitsuba.validation.study import findings
 
 WIDTH = 32
 HEIGHT = 24

@@ -24,8 +24,8 @@ from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.oracles.reference import reference_render
 from mrt_mitsuba.validation.studies import error_vs_time, roughconductor, scenes, speed
 from mrt_mitsuba.validation.studies import filters as filter_study
-from mrt_mitsuba.validation.tools.scenery import sensor, with_materials
-from mrt_mitsuba.validation.tools.study import Study, findings, in_turns, ratio
+from mrt_mitsuba.validation.scenery import sensor, with_materials
+from mrt_mitsuba.validation.study import Study, findings, in_turns, ratio
 
 for needed in cli.EXTRAS:
     pytest.importorskip(needed)

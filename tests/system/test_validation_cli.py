@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from mrt_mitsuba.validation import cli
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.study import Study
 
 for needed in cli.EXTRAS:
     pytest.importorskip(needed)

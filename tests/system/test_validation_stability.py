@@ -12,7 +12,7 @@ from cases import Cases
 from mrt_mitsuba import filters
 from mrt_mitsuba.plugins import fresnel, hit_errors, lobes, microfacet
 from mrt_mitsuba.validation.studies import stability
-from mrt_mitsuba.validation.tools.study import findings
+from mrt_mitsuba.validation.study import findings
 
 pytestmark = pytest.mark.usefixtures("variant")
 

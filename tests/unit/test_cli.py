@@ -22,7 +22,7 @@ from mrt_mitsuba.command.render import banner
 from mrt_mitsuba.errors import MrtError, MrtWarning, SceneError
 from mrt_mitsuba.rendering import api
 from mrt_mitsuba.rendering.progress import TerminalProgress
-from mrt_mitsuba.validation.tools.compare import Difference
+from mrt_mitsuba.validation.compare import Difference
 
 SMALL = ("width=16", "height=12")
 

@@ -41,7 +41,7 @@ from mrt_mitsuba.validation.laws.sphere import (
     hold_small,
     integrate,
 )
-from mrt_mitsuba.validation.tools.compare import sidak
+from mrt_mitsuba.validation.compare import sidak
 
 NUDGED = """for moved in np.eye(3) * 2.0**-18 * np.where(np.array(u) < 0.5, 1, -1):
     a, b, c = map(float, np.array(u) + moved)

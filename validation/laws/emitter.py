@@ -39,7 +39,7 @@ from mrt_mitsuba.validation.laws.sphere import (
     least_of,
 )
 from mrt_mitsuba.validation.laws.subject import Given, Subject, judge_many
-from mrt_mitsuba.validation.tools.compare import sidak
+from mrt_mitsuba.validation.compare import sidak
 
 SAME = 1e-3  # relative: the same formula, evaluated once more
 TURNED = 4 * probe.ROUNDED  # a direction passes through angles, a transform, and back

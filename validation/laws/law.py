@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mrt_mitsuba.validation.laws.probe import Lanes
-from mrt_mitsuba.validation.tools.study import Bound
+from mrt_mitsuba.validation.study import Bound
 
 LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
 ONE_IN_A_MILLION = "one false alarm in a million checks"

@@ -39,7 +39,7 @@ from mrt_mitsuba.validation.laws.shape_case import (
     trace,
     walk,
 )
-from mrt_mitsuba.validation.tools.compare import sidak
+from mrt_mitsuba.validation.compare import sidak
 
 POSITIONS = """n = 100_000
 rng = mi.PCG32(n)

@@ -9,8 +9,8 @@ from typing import Any
 import mitsuba as mi
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.tools.study import Study, Values
-from mrt_mitsuba.validation.tools.work_precision import Findings, describe, error_vs_time
+from mrt_mitsuba.validation.study import Study, Values
+from mrt_mitsuba.validation.work_precision import Findings, describe, error_vs_time
 
 TITLE = "Error against run time"
 

@@ -21,10 +21,10 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba import filters
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.tools.compare import compare
-from mrt_mitsuba.validation.tools.renders import load
-from mrt_mitsuba.validation.tools.scenery import AT_CENTRES
-from mrt_mitsuba.validation.tools.study import Study, Values
+from mrt_mitsuba.validation.compare import compare
+from mrt_mitsuba.validation.renders import load
+from mrt_mitsuba.validation.scenery import AT_CENTRES
+from mrt_mitsuba.validation.study import Study, Values
 
 TITLE = "Filters: edges against noise, blur against a lens"
 

@@ -10,9 +10,9 @@ import numpy as np
 from scipy import stats
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.tools.compare import Array, averaged
-from mrt_mitsuba.validation.tools.scenery import load_room
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation.compare import Array, averaged
+from mrt_mitsuba.validation.scenery import load_room
+from mrt_mitsuba.validation.study import Study
 
 TITLE = "Errors that can be trusted"
 SIZE, SPP = 48, 64

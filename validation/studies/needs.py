@@ -18,8 +18,8 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.files import LAYERS
 from mrt_mitsuba.rendering.api import Result
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.study import Study, Values, operations, timed_in_turns
+from mrt_mitsuba.validation import plotting
+from mrt_mitsuba.validation.study import Study, Values, operations, timed_in_turns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -130,23 +130,23 @@ def savings(name: str, rows: Sequence[Values]) -> Figure:
     most = max(times.max(), 1.2)
     places = np.arange(len(rows))
     quantity = EngFormatter("s" if name == "seconds" else "")
-    drawn, axes = diagrams.panel(TITLES[name], 4.6, 0.3 * len(rows) + 1)
+    drawn, axes = plotting.panel(TITLES[name], 4.6, 0.3 * len(rows) + 1)
     bars = axes.barh(places, np.maximum(times, 1), height=0.7, color="#f2b98f")
     axes.bar_label(
         bars,
         [f"× {factor:.2f}" for factor in times],
         padding=3,
-        color=diagrams.TEXT,
-        fontsize=diagrams.LABELS,
+        color=plotting.TEXT,
+        fontsize=plotting.LABELS,
     )
-    axes.barh(places, np.ones(len(rows)), height=0.7, color=diagrams.COLORS[0])
+    axes.barh(places, np.ones(len(rows)), height=0.7, color=plotting.COLORS[0])
     for place, row in enumerate(rows):
         own = quantity(float(f"{row[name]:.3g}"))
-        axes.text(0.02 * most, place, own, color="white", va="center", fontsize=diagrams.LABELS)
+        axes.text(0.02 * most, place, own, color="white", va="center", fontsize=plotting.LABELS)
     axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, 1.25 * most))
     axes.set_yticks(places, [f"scene {row['scene']}" for row in rows])
     axes.tick_params(axis="y", length=0)
-    axes.set_xlabel("times as much as planned", **diagrams.WORDS)
+    axes.set_xlabel("times as much as planned", **plotting.WORDS)
     axes.spines["left"].set_visible(False)
-    axes.axvline(1, color=diagrams.TEXT, linewidth=0.6)
+    axes.axvline(1, color=plotting.TEXT, linewidth=0.6)
     return drawn

@@ -11,7 +11,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import reference_render
-from mrt_mitsuba.validation.tools.study import Study, Values
+from mrt_mitsuba.validation.study import Study, Values
 
 TITLE = "Pictures of the scenes, judged in float64"
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 
 from mrt_mitsuba.validation.studies.stability import curves, finite, geometry, reflectance, transport
 from mrt_mitsuba.validation.studies.stability.case import Case
-from mrt_mitsuba.validation.tools.study import Bound, Study
+from mrt_mitsuba.validation.study import Bound, Study
 
 TITLE = "Numerical stability on stiff and extreme cases"
 

@@ -25,9 +25,9 @@ from mrt_mitsuba.validation.studies.stability.geometry import (
     lit,
     trace_of,
 )
-from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.bsdf_probe import evaluate, pairs_about
-from mrt_mitsuba.validation.tools.study import Study
+from mrt_mitsuba.validation import plotting
+from mrt_mitsuba.validation.bsdf_probe import evaluate, pairs_about
+from mrt_mitsuba.validation.study import Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -100,26 +100,26 @@ def show(study: Study, *, quick: bool, places: int = 0) -> None:
 
 def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
     """Draw errors in roundings of float32 along an axis; all axes have the same scale."""
-    drawn, axes = diagrams.panel(axis.title, 4.6, 3.2)
-    blue, orange, *_ = diagrams.COLORS
+    drawn, axes = plotting.panel(axis.title, 4.6, 3.2)
+    blue, orange, *_ = plotting.COLORS
     axes.axhspan(0.1, axis.limit, color="#dcebf7", zorder=0)
     axes.axhline(axis.limit, color=blue, linestyle=":", linewidth=1)
-    axes.plot(x, lines[FIRST], color=diagrams.GREY, linestyle=(0, (4, 2)), linewidth=1.4)
+    axes.plot(x, lines[FIRST], color=plotting.GREY, linestyle=(0, (4, 2)), linewidth=1.4)
     axes.plot(x, lines[THEIRS], color=orange, linewidth=1.4)
     axes.plot(x, lines[OURS], color=blue, linewidth=2.4)
     axes.set(xscale="log", yscale="log", ylim=(0.2, 10 * NONE_RIGHT))
-    diagrams.powers_of_ten(axes.xaxis, axes.yaxis)
-    axes.set_xlabel(axis.label, **diagrams.WORDS)
-    axes.set_ylabel("error in roundings", **diagrams.WORDS)
+    plotting.powers_of_ten(axes.xaxis, axes.yaxis)
+    axes.set_xlabel(axis.label, **plotting.WORDS)
+    axes.set_ylabel("error in roundings", **plotting.WORDS)
     axes.grid(alpha=0.2)
-    diagrams.note(axes, 0.5, 0.9, "no digit is right", va="bottom", ha="center")
+    plotting.note(axes, 0.5, 0.9, "no digit is right", va="bottom", ha="center")
     ends = {
-        FIRST: (x[-1], lines[FIRST][-1], diagrams.GREY),
+        FIRST: (x[-1], lines[FIRST][-1], plotting.GREY),
         axis.nearest: (x[-1], lines[THEIRS][-1], orange),
         OURS: (x[-1], lines[OURS][-1], blue),
         "promised": (x[-1], axis.limit, blue),
     }
-    diagrams.label_ends(axes, ends)
+    plotting.label_ends(axes, ends)
     return drawn
 
 

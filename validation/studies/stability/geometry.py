@@ -18,7 +18,7 @@ from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mes
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import Array, dot, nearest, unit
 from mrt_mitsuba.validation.studies.stability.case import Case
-from mrt_mitsuba.validation.tools.study import Values
+from mrt_mitsuba.validation.study import Values
 
 Point = tuple[float, float, float]
 

@@ -16,7 +16,7 @@ from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation.oracles.reference import reference_render
 from mrt_mitsuba.validation.studies.stability.case import Case
-from mrt_mitsuba.validation.tools.study import Values
+from mrt_mitsuba.validation.study import Values
 
 WIDTH = 64
 HEIGHT = 48

@@ -11,7 +11,7 @@ from mrt_mitsuba.errors import MrtError, SceneError, UsageError
 from mrt_mitsuba.options import NUMBER, SWITCH
 from mrt_mitsuba.options import check as checked
 from mrt_mitsuba.rendering.progress import TerminalProgress
-from mrt_mitsuba.validation.tools.study import Bound, prepare_folder
+from mrt_mitsuba.validation.study import Bound, prepare_folder
 
 AT_LEAST = ("psnr", "p_value")  # the limits of other measures are at most
 KEYS = ("reference", "cases", "shared", "repeats", "errors")  # of a file of cases
@@ -19,7 +19,7 @@ KEYS = ("reference", "cases", "shared", "repeats", "errors")  # of a file of cas
 
 def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: str) -> int:
     """Compare two EXR files; return 0, or 1 beyond a limit. Raises ``UsageError`` if they do not compare."""
-    from mrt_mitsuba.validation.tools.compare import UNDEFINED, compare
+    from mrt_mitsuba.validation.compare import UNDEFINED, compare
 
     wanted = {name: checked(name, NUMBER, text, text=True) for name, text in limits.items()}
     try:
@@ -52,7 +52,7 @@ def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
 
 def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
     """Measure the cases of a TOML file; return 0, or 1 where one of them failed."""
-    from mrt_mitsuba.validation.tools import work_precision
+    from mrt_mitsuba.validation import work_precision
 
     settings = read_toml(cases)
     wrong = [f"an unknown entry {name!r}" for name in sorted(settings.keys() - set(KEYS))]

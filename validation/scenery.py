@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.scene.model import Material, Scene
-from mrt_mitsuba.validation.tools.bsdf_probe import rgb
+from mrt_mitsuba.validation.bsdf_probe import rgb
 
 Node = dict[str, Any]
 Point = list[float]

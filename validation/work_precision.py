@@ -24,9 +24,9 @@ from mrt_mitsuba.options import is_path
 from mrt_mitsuba.rendering.api import Result, render
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.scene.open import open_scene
-from mrt_mitsuba.validation.tools import diagrams
-from mrt_mitsuba.validation.tools.compare import Array, Difference, compare, read_layer
-from mrt_mitsuba.validation.tools.study import Study, Values, notebook, save_report
+from mrt_mitsuba.validation import plotting
+from mrt_mitsuba.validation.compare import Array, Difference, compare, read_layer
+from mrt_mitsuba.validation.study import Study, Values, notebook, save_report
 
 TITLE = "Error against time"
 LEAST = 0.05  # seconds that one timing takes: a shorter render is repeated, and the mean counts
@@ -453,7 +453,7 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
         f"{own if found.reference_error else 'not known'}. "
     )
     caption += " ".join(found.verdicts)
-    drawn = diagrams.work_precision(title, found)
+    drawn = plotting.work_precision(title, found)
     study.picture(f"{prefix}diagram", f"{title}: work and precision", drawn, caption)
     if found.errors:
         study.records(f"{prefix}advice", f"{title}: what to use", found.advice(), first=not name)

@@ -1,1 +1,0 @@
-"""Parts of studies: bounds, the report page, image tests, timing, probes."""
