@@ -14,12 +14,12 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba.files.images import to_8bit
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.validation.studies import error_vs_time, needs
-from mrt_mitsuba.validation.studies.honest import by_tenths
-from mrt_mitsuba.validation.studies.stability import curves
 from mrt_mitsuba.validation import plotting
 from mrt_mitsuba.validation.compare import averaged
 from mrt_mitsuba.validation.originals import read_original
+from mrt_mitsuba.validation.studies import error_vs_time, needs
+from mrt_mitsuba.validation.studies.honest import by_tenths
+from mrt_mitsuba.validation.studies.stability import curves
 from mrt_mitsuba.validation.study import Study, findings
 from mrt_mitsuba.validation.work_precision import Findings
 

@@ -23,8 +23,7 @@ import mrt_mitsuba as mrt  # first: it chooses the LLVM library
 import mitsuba as mi
 
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.validation import figures
-from mrt_mitsuba.validation import plotting
+from mrt_mitsuba.validation import figures, plotting
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from mrt_mitsuba.validation import bench
+from mrt_mitsuba.validation import bench, renders
 from mrt_mitsuba.validation.studies import speed
-from mrt_mitsuba.validation import renders
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,10 @@ import pytest
 from matplotlib.text import Text
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation import figures
+from mrt_mitsuba.validation import figures, plotting
+from mrt_mitsuba.validation.compare import compare
 from mrt_mitsuba.validation.studies import error_vs_time, needs
 from mrt_mitsuba.validation.studies.stability import curves
-from mrt_mitsuba.validation import plotting
-from mrt_mitsuba.validation.compare import compare
 from mrt_mitsuba.validation.study import findings
 from mrt_mitsuba.validation.work_precision import Findings, Point
 

@@ -20,9 +20,9 @@ from mrt_mitsuba.command.main import main
 from mrt_mitsuba.files import read_exr
 from mrt_mitsuba.machine import Workspace
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.validation.studies import adaptive, honest
 from mrt_mitsuba.validation.compare import averaged
 from mrt_mitsuba.validation.scenery import SCENES, SPP, load, load_kind, sensor
+from mrt_mitsuba.validation.studies import adaptive, honest
 from mrt_mitsuba.validation.study import findings
 
 WIDTH = 32

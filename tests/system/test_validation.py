@@ -22,9 +22,9 @@ from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.oracles.reference import reference_render
+from mrt_mitsuba.validation.scenery import sensor, with_materials
 from mrt_mitsuba.validation.studies import error_vs_time, roughconductor, scenes, speed
 from mrt_mitsuba.validation.studies import filters as filter_study
-from mrt_mitsuba.validation.scenery import sensor, with_materials
 from mrt_mitsuba.validation.study import Study, findings, in_turns, ratio
 
 for needed in cli.EXTRAS:

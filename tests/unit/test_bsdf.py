@@ -12,11 +12,11 @@ from cases import but_slow
 from numpy.testing import assert_allclose
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.validation.bsdf_probe import at_angle, evaluate, lobe_pairs, rgb
 from mrt_mitsuba.validation.laws import probe
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies import bsdf_laws
 from mrt_mitsuba.validation.studies.roughconductor import POINTWISE, compare_pointwise
-from mrt_mitsuba.validation.bsdf_probe import at_angle, evaluate, lobe_pairs, rgb
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
+from mrt_mitsuba.validation.compare import sidak
 from mrt_mitsuba.validation.laws import probe
 from mrt_mitsuba.validation.laws.bsdf_case import FIT, POINTWISE, Case, View, live, narrow
 from mrt_mitsuba.validation.laws.bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
@@ -41,7 +42,6 @@ from mrt_mitsuba.validation.laws.sphere import (
     hold_small,
     integrate,
 )
-from mrt_mitsuba.validation.compare import sidak
 
 NUDGED = """for moved in np.eye(3) * 2.0**-18 * np.where(np.array(u) < 0.5, 1, -1):
     a, b, c = map(float, np.array(u) + moved)

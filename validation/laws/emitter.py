@@ -13,6 +13,7 @@ from numpy.linalg import norm
 from scipy import stats
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.validation.compare import sidak
 from mrt_mitsuba.validation.laws import probe
 from mrt_mitsuba.validation.laws.examine import TIMEOUT, Check, examine
 from mrt_mitsuba.validation.laws.faults import DEGREE, PLACE, larger, no_number, put
@@ -39,7 +40,6 @@ from mrt_mitsuba.validation.laws.sphere import (
     least_of,
 )
 from mrt_mitsuba.validation.laws.subject import Given, Subject, judge_many
-from mrt_mitsuba.validation.compare import sidak
 
 SAME = 1e-3  # relative: the same formula, evaluated once more
 TURNED = 4 * probe.ROUNDED  # a direction passes through angles, a transform, and back

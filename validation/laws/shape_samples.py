@@ -10,6 +10,7 @@ import numpy as np
 from numpy.linalg import norm
 from scipy.linalg import null_space
 
+from mrt_mitsuba.validation.compare import sidak
 from mrt_mitsuba.validation.laws.faults import larger, member, off_surface, put, smaller, tilted
 from mrt_mitsuba.validation.laws.law import (
     SIGMAS,
@@ -39,7 +40,6 @@ from mrt_mitsuba.validation.laws.shape_case import (
     trace,
     walk,
 )
-from mrt_mitsuba.validation.compare import sidak
 
 POSITIONS = """n = 100_000
 rng = mi.PCG32(n)

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+from mrt_mitsuba.validation.compare import sidak
 from mrt_mitsuba.validation.laws.law import NOWHERE, Law
 from mrt_mitsuba.validation.laws.probe import Array, Function, Lanes, finite_or_0, joined
-from mrt_mitsuba.validation.compare import sidak
 
 DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
 SIDE = 6

@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.laws.bsdf import check_bsdf
 from mrt_mitsuba.validation.bsdf_probe import albedo, at_angle, rgb
+from mrt_mitsuba.validation.laws.bsdf import check_bsdf
 from mrt_mitsuba.validation.study import Bound, Study
 
 TITLE = "Laws of the BSDF: sampling, energy, reciprocity, gradients, known numbers"

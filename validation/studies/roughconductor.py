@@ -16,10 +16,10 @@ from scipy.special import erfc
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.files.images import write_exr
-from mrt_mitsuba.validation.laws.probe import is_scalar
-from mrt_mitsuba.validation.oracles.reference import smith_g1
 from mrt_mitsuba.validation.bsdf_probe import evaluate, lobe_pairs, relative_error
 from mrt_mitsuba.validation.compare import compare, p_values
+from mrt_mitsuba.validation.laws.probe import is_scalar
+from mrt_mitsuba.validation.oracles.reference import smith_g1
 from mrt_mitsuba.validation.scenery import ball_scene
 from mrt_mitsuba.validation.study import Study, Values, timed_in_turns
 

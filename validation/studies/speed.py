@@ -23,9 +23,9 @@ import numpy as np
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.studies import roughconductor
 from mrt_mitsuba.validation import renders
 from mrt_mitsuba.validation.renders import load
+from mrt_mitsuba.validation.studies import roughconductor
 from mrt_mitsuba.validation.study import Study, Values, operations, ratio
 
 TITLE = "Speed: against Mitsuba's own plugins, other ways and smaller tasks"

@@ -13,9 +13,9 @@ import numpy as np
 import mrt_mitsuba as mrt
 from mrt_mitsuba.scene.model import Material
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.studies.speed import DIRECT
 from mrt_mitsuba.validation.compare import p_values
 from mrt_mitsuba.validation.scenery import AT_CENTRES, with_materials
+from mrt_mitsuba.validation.studies.speed import DIRECT
 from mrt_mitsuba.validation.study import Study, Values
 
 TITLE = "Against Mitsuba's own integrators, lights and materials"

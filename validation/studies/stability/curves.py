@@ -14,6 +14,8 @@ from numpy.linalg import norm
 
 from mrt_mitsuba.plugins import fresnel
 from mrt_mitsuba.scene.model import Cone, Cylinder, Plane, Sphere
+from mrt_mitsuba.validation import plotting
+from mrt_mitsuba.validation.bsdf_probe import evaluate, pairs_about
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.oracles.reference import Array, dot, smith_g1, unit
 from mrt_mitsuba.validation.studies import roughconductor
@@ -25,8 +27,6 @@ from mrt_mitsuba.validation.studies.stability.geometry import (
     lit,
     trace_of,
 )
-from mrt_mitsuba.validation import plotting
-from mrt_mitsuba.validation.bsdf_probe import evaluate, pairs_about
 from mrt_mitsuba.validation.study import Study
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ import numpy as np
 
 from mrt_mitsuba.plugins import fresnel, microfacet
 from mrt_mitsuba.plugins.quadric_kinds import Columns
+from mrt_mitsuba.validation.bsdf_probe import pairs_about
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.studies.stability.case import Case
-from mrt_mitsuba.validation.bsdf_probe import pairs_about
 
 # Of tan²θh / alpha², minus the logarithm of exp(-…): the lobe is at 1e-7 of its peak, and at 1e-20
 IN_BOUND, STEEPEST = -np.log([1e-7, 1e-20])
