@@ -63,9 +63,9 @@ class MrtBSDF(mi.BSDF):
 
     Nearest stock plugins: ``roughconductor`` (same D and G, exact conductor Fresnel, no diffuse part) and
     ``roughplastic`` (same lobes, but the diffuse part is refracted through the interface). Reflection is on
-    the side of the normal only. The attribute ``mirror_reflectance`` (``eval_attribute``) is k_s F(θi), the
-    weight that ``mrt_whitted`` gives to the mirror ray, and ``int_ior`` (``eval_attribute_1``) drives its
-    bounce budget.
+    the side of the normal only. Attributes (``has_attribute``, ``eval_attribute``) are all parameters and
+    ``mirror_reflectance``, k_s F(θi), the weight that ``mrt_whitted`` gives to the mirror ray; ``int_ior``
+    drives its bounce budget.
     In polarised variants the reflected light is depolarised. Samples and their density are constants in
     derivatives: ``sample`` returns the value, which follows the parameters, over the density, which does not.
     """
@@ -122,16 +122,18 @@ class MrtBSDF(mi.BSDF):
         return Lobes(self.fresnel, given, si.wi, visible=self.sample_visible)
 
     def fixed_row(self) -> np.ndarray | str:
-        """Return the parameters as plain numbers [1 + lobes, 4], or why they are none: numbers, and a
-        reflectance for each lobe.
+        """Return the parameters as plain numbers [2 + lobes, 4], or why they are none: numbers, a reflectance
+        for each lobe, and that at normal incidence.
         """
-        if "f0" in self.parameters or any(map(varies, self.parameters.values())):
+        if any(map(varies, self.parameters.values())):
             return VARYING
         given = self.lobes(dr.zeros(mi.SurfaceInteraction3f), True).given
         if dr.grad_enabled(given):
             return GRADIENTS
-        row = np.zeros((1 + len(LOBES), 4))
-        parts = [given[name] for name in NUMBERS], *(given[lobe.reflectance] for lobe in LOBES)
+        row = np.zeros((2 + len(LOBES), 4))
+        from_iors = mi.UnpolarizedSpectrum(f0_from_ior(given["ext_ior"], given["int_ior"]))
+        colors = [given[lobe.reflectance] for lobe in LOBES] + [given.get("f0", from_iors)]
+        parts = [given[name] for name in NUMBERS], *colors
         for k, part in enumerate(parts):
             row[k, : len(part)] = [first(value) for value in part]
         return row
@@ -180,20 +182,33 @@ class MrtBSDF(mi.BSDF):
     def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         return mi.Spectrum(self._read("diffuse_reflectance", si, active))
 
+    # All parameters, and ``mirror_reflectance``. Calls for other names must not raise: Dr.Jit records them
+    # for every material of a scene
+
     def has_attribute(self, name: str, active: mi.Bool = True) -> mi.Bool:
-        return name in ("mirror_reflectance", "int_ior")
+        return name == "mirror_reflectance" or name in self.parameters
 
     def eval_attribute(
         self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool = True
     ) -> mi.UnpolarizedSpectrum:
         if name == "mirror_reflectance":
             return self.lobes(si, active).mirror_reflectance
-        raise ParameterError(f'mrt_bsdf: no spectrum attribute "{name}"; there is "mirror_reflectance"')
+        if name in self.parameters:
+            return mi.UnpolarizedSpectrum(self._read(name, si, active))
+        return mi.BSDF.eval_attribute(self, name, si, active)
 
     def eval_attribute_1(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Float:
-        if name == "int_ior":
-            return self._read("int_ior", si, active)
-        raise ParameterError(f'mrt_bsdf: no scalar attribute "{name}"; there is "int_ior"')
+        parameter = self.parameters.get(name)
+        if isinstance(parameter, mi.Texture):
+            return parameter.eval_1(si, active)
+        if parameter is not None:
+            return plain(parameter)
+        return mi.BSDF.eval_attribute_1(self, name, si, active)
+
+    def eval_attribute_3(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
+        if name in NUMBERS:
+            return mi.Color3f(self._read(name, si, active))
+        return mi.BSDF.eval_attribute_3(self, name, si, active)
 
     def mirror_bound(self) -> Mirror:
         """Return upper bounds of ``mirror_reflectance``, and ``int_ior``; inf for what varies."""

@@ -46,6 +46,10 @@ class MaterialTable:
 
     def __init__(self, shapes: Sequence[mi.Shape], rows: Sequence[np.ndarray]) -> None:
         self.fresnel = shapes[0].bsdf().fresnel
+        #: the names of the colours of a row; ``f0`` is read only where a material has one of its own
+        self.colors = [lobe.reflectance for lobe in LOBES]
+        if any("f0" in shape.bsdf().parameters for shape in shapes):
+            self.colors.append("f0")
         self.by_shape = ByShape(mi.Vector4f, shapes, rows, [1] * 4)
 
     def lobes(self, si: mi.SurfaceInteraction3f) -> Lobes:
@@ -54,9 +58,9 @@ class MaterialTable:
         numbers = self.by_shape(si, mi.Bool(True))
         channels = dr.size_v(mi.UnpolarizedSpectrum)
         given = dict(zip(NUMBERS, numbers, strict=False))
-        for part, lobe in enumerate(LOBES, start=1):
+        for part, name in enumerate(self.colors, start=1):
             color = self.by_shape(si, mi.Bool(True), part)
-            given[lobe.reflectance] = mi.UnpolarizedSpectrum(list(color)[:channels])
+            given[name] = mi.UnpolarizedSpectrum(list(color)[:channels])
         return Lobes(self.fresnel, given, si.wi)
 
 

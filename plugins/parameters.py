@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-if TYPE_CHECKING:
-    import mitsuba as mi
+from .variants import unbounded_reflectance
 
 # Mitsuba computes in float32, where larger numbers would become infinite, and smaller ones zero
 LARGEST = 3.4e38
@@ -22,6 +22,10 @@ MOST_SEGMENTS = 65536
 
 class ParameterError(ValueError):
     """A plugin parameter has a wrong value. The text names plugin, key, value and what is allowed."""
+
+
+class PluginError(RuntimeError):
+    """A plugin raised while rays were traced. The text names it and has its own message."""
 
 
 def _fail(props: mi.Properties, name: str, value: object, allowed: str) -> NoReturn:
@@ -132,6 +136,8 @@ def spectrum(
         levels = value if isinstance(value, list) else [value]
         if isinstance(value, bool) or not all(0 <= x <= LARGEST for x in levels):
             _fail(props, name, value, "finite and not negative")
+        if isinstance(value, list) and mi.is_spectral and not emissive and max(levels) > 1:
+            return unbounded_reflectance(value)
     read = props.get_emissive_texture if emissive else props.get_unbounded_texture
     try:
         return read(name) if default is None else read(name, default)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 
 from .parameters import ParameterError, text
 
@@ -11,7 +12,8 @@ class MrtTexture(mi.Texture):
     r"""The texel nearest to (u, v), as it is stored.
 
     With u, v clamped to [0, 1] and a picture of w × h texels, column int((w − 1) u + ½) mod w of row
-    int((h − 1) v + ½) mod h; v = 0 is the first row of the picture, values are not decoded from sRGB.
+    int((h − 1) v + ½) mod h; v = 0 is the first row of the picture, values are not decoded from sRGB and may
+    exceed 1 in all variants (Mitsuba's ``bitmap`` clamps them in spectral ones).
 
     ============ ========== ========== ==============================================================
     name         type       default    unit or range
@@ -42,22 +44,27 @@ class MrtTexture(mi.Texture):
         scale = [(width - 1) / width, (height - 1) / height, 1]
         to_uv = mi.ScalarTransform4f().translate([0.5 / width, 0.5 / height, 0]).scale(scale)
         stock = {"type": "bitmap", "bitmap": bitmap, "filter_type": "nearest", "wrap_mode": "clamp"}
+        # In spectral variants, Mitsuba's textures end at 1: brighter pictures are scaled, as colours are
+        brightest = float(np.max(np.array(bitmap)))
+        self.scale = 2 * brightest if mi.is_spectral and brightest > 1 else 1.0
+        if self.scale > 1:
+            stock["bitmap"] = mi.Bitmap(np.array(bitmap) / np.float32(self.scale))
         self.texels = mi.load_dict({**stock, "to_uv": to_uv})
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("texels", self.texels, mi.ParamFlags.Differentiable)
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
-        return self.texels.eval(si, active)
+        return self.scale * self.texels.eval(si, active)
 
     def eval_1(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Float:
-        return self.texels.eval_1(si, active)
+        return self.scale * self.texels.eval_1(si, active)
 
     def eval_3(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Color3f:
-        return self.texels.eval_3(si, active)
+        return self.scale * self.texels.eval_3(si, active)
 
     def mean(self) -> mi.Float:
-        return self.texels.mean()
+        return self.scale * self.texels.mean()
 
     def is_spatially_varying(self) -> bool:
         return True

@@ -64,16 +64,37 @@ def varies(value: object) -> bool:
     return bool(denies or value.is_spatially_varying())
 
 
+def _spectrum(texture: mi.Texture) -> mi.Float | list[float]:
+    """Return the values of a spectrum at each nanometre from ``MI_CIE_MIN`` on."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    wavelengths = range(int(mi.MI_CIE_MIN), int(mi.MI_CIE_MAX) + 1)
+    if is_jit():
+        si.wavelengths[0] = dr.linspace(mi.Float, wavelengths[0], wavelengths[-1], len(wavelengths))
+        return texture.eval(si)[0]
+    values = []
+    for wavelength in wavelengths:
+        si.wavelengths = mi.UnpolarizedSpectrum(wavelength)
+        values.append(texture.eval(si)[0])
+    return values
+
+
+def unbounded_reflectance(color: Sequence[float]) -> mi.Texture:
+    """Return a reflectance spectrum of a colour that exceeds 1, in a spectral variant.
+
+    Mitsuba's own spectra of colours end at 1. As those of its lights, this one is the spectrum of a colour of
+    at most a half, times a factor; it is sampled at each nanometre.
+    """
+    factor = 2 * max(color)
+    half = mi.load_dict({"type": "srgb", "color": mi.ScalarColor3f([c / factor for c in color])})
+    samples = (factor * np.array(_spectrum(half))).tolist()
+    return mi.load_dict({"type": "spectrum", "value": list(enumerate(samples, start=int(mi.MI_CIE_MIN)))})
+
+
 def largest(texture: mi.Texture) -> float:
     """Return the largest value of a texture; inf where it is not known."""
-    if varies(texture) or (mi.is_spectral and not is_jit()):
+    if varies(texture):
         return math.inf
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    if mi.is_spectral:  # each nanometre
-        count = int(mi.MI_CIE_MAX - mi.MI_CIE_MIN) + 1
-        si = dr.zeros(mi.SurfaceInteraction3f, count)
-        si.wavelengths[0] = dr.linspace(mi.Float, mi.MI_CIE_MIN, mi.MI_CIE_MAX, count)
-    value = texture.eval(si)
+    value = _spectrum(texture) if mi.is_spectral else texture.eval(dr.zeros(mi.SurfaceInteraction3f))
     if dr.grad_enabled(value):
         return math.inf
     if mi.is_spectral:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import signal
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +17,7 @@ import mitsuba as mi
 
 from .facts import Reading
 from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, make_plan
-from .parameters import LARGEST, ParameterError, choice, flag, integer, number, spectrum
+from .parameters import LARGEST, ParameterError, PluginError, choice, flag, integer, number, spectrum
 from .point_buffer import PointBuffer
 from .scene_data import Hit, SceneData
 from .signals import left_to_other_threads
@@ -182,7 +183,15 @@ class MrtWhitted(mi.SamplingIntegrator):
         ``data``: from ``prepare``, which is called without it, for the scene as it is now.
         """
         data = self.prepare(scene) if data is None else data
+        try:
+            return self._trace(data, sampler, ray, active)
+        except Exception as error:
+            described = _plugin_error(error)
+            if described is None:
+                raise
+            raise described from error
 
+    def _trace(self, data: SceneData, sampler: mi.Sampler | None, ray: mi.Ray3f, active: mi.Bool) -> Trace:
         def follow(s: dict, eye: PointBuffer | None = None) -> tuple[dict, Hit]:
             """Trace the next ray of each path."""
             hit = data.intersect(s["ray"], s["active"], eye)
@@ -337,3 +346,21 @@ class MrtWhitted(mi.SamplingIntegrator):
             tenths = mi.Int32(dr.minimum(10 * int_ior, 10))
             cost = mi.UInt32(dr.maximum(10 - tenths, 1))
         return radiance, shadow_rays, reflectance, cost, sampler
+
+
+def _plugin_error(error: BaseException) -> PluginError | None:
+    """Return an error that names the plugin which raised, and its message, where Dr.Jit's own says "see
+    above"; None for an error that is nobody's.
+    """
+    cause = error
+    while cause.__cause__ is not None:
+        cause = cause.__cause__
+    if not isinstance(cause, Exception):  # an interrupt
+        return None
+    for frame, _ in reversed(list(traceback.walk_tb(cause.__traceback__))):
+        plugin = frame.f_locals.get("self")
+        if isinstance(plugin, mi.Object) and not isinstance(plugin, MrtWhitted):
+            name = type(plugin).__name__
+            function = frame.f_code.co_name
+            return PluginError(f"mrt_whitted: {name}.{function} raised {type(cause).__name__}: {cause}")
+    return None if cause is error else PluginError(f"mrt_whitted: {cause}")

@@ -241,6 +241,27 @@ def test_a_class_derived_from_mrt_bsdf_is_called(variant):
     assert np.array(mi.render(scene(**content), spp=1)).max() == 0
 
 
+@both_doors
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+def test_materials_may_change_places(variant, door):
+    """The same materials on the same shapes, and only which is whose has changed."""
+    red, blue = (mi.load_dict({"type": "mrt_bsdf", "diffuse_reflectance": rgb(*c)}) for c in np.eye(3)[::2])
+    nodes = {f"s{k}": {"type": "sphere", "center": [3 * k - 3, 0, 0]} for k in range(3)}
+    for node, material in zip(nodes.values(), (red, blue, red), strict=True):
+        node["bsdf"] = material
+    nodes |= {
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted"},
+        "sensor": sensor([0, 0, 9], [0, 0, 0], (48, 8)),
+    }
+    nodes["light"] = {"type": "mrt_light", "position": [0, 0, 40]}
+    loaded = mi.load_dict(nodes)
+    middles = np.s_[4, [10, 24, 38]]
+    assert (DOORS[door](loaded)[middles].argmax(axis=1) == [0, 2, 0]).all()
+    loaded.shapes()[2].set_bsdf(blue)
+    assert (DOORS[door](loaded)[middles].argmax(axis=1) == [0, 2, 2]).all()
+
+
 def test_a_texture_that_does_not_say_that_it_varies(variant):
     """A class in Python inherits from Mitsuba that it is uniform."""
 

@@ -211,6 +211,64 @@ def test_colours_and_numbers_from_textures():
         assert_allclose(diffuse, [numbers["diffuse_reflectance"][i]] * 100, rtol=1e-6)
 
 
+def test_samples_of_two_lobes_weigh_the_same():
+    """The albedo that chooses a lobe has Fresnel's reflectance in it: seen from the normal, 0.04 of gloss."""
+    b = bsdf(alpha=1e-3, fresnel="dielectric", diffuse_reflectance=0.3, specular_reflectance=0.9)
+    drawn = draw(b, at_angle(20), 10_000)
+    assert set(drawn.lobe) == {0, 1}
+    assert_allclose(drawn.weight, np.mean(drawn.weight), rtol=1e-3)
+
+
+COLOR = (1.5, 1.2, 1.0)
+CYAN = (0.1, 2.0, 2.5)
+
+
+def linear_srgb(texture: mi.Texture) -> np.ndarray:
+    """Return the colour of a reflectance under daylight."""
+    daylight = mi.load_dict({"type": "d65"})
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    sums = np.zeros((2, 3))
+    for wavelength in range(362, 830, 4):
+        si.wavelengths = mi.UnpolarizedSpectrum(wavelength)
+        xyz = [np.ravel(c)[0] for c in mi.cie1931_xyz(mi.Float(wavelength))]
+        for row, factor in zip(sums, (texture.eval(si)[0], mi.Float(1)), strict=True):
+            row += np.ravel(factor * daylight.eval(si)[0])[0] * np.array(xyz)
+    found, white = (np.array(mi.xyz_to_srgb(mi.Color3f(row.tolist()))).ravel() for row in sums)
+    return found / white
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "scalar_spectral"], indirect=True)
+@pytest.mark.parametrize("color", [COLOR, CYAN])
+@pytest.mark.parametrize("name", ["diffuse_reflectance", "specular_reflectance", "f0", "texture"])
+def test_colours_above_one_are_kept_in_spectral_variants(variant, name, color):
+    bitmap = mi.Bitmap(np.full((2, 2, 3), color, np.float32))
+    if name == "texture":
+        texture = mi.load_dict({"type": "mrt_texture", "bitmap": bitmap})
+    else:
+        texture = bsdf(**{name: rgb(color)}).parameters[name]
+    assert_allclose(linear_srgb(texture), color, rtol=0.02, atol=0.02)
+
+
+@in_variants
+def test_attributes_are_all_parameters(variant):
+    """As those of Mitsuba's own materials are, with numbers, colours and textures."""
+    gray = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 1), 0.3, np.float32)), "raw": True}
+    b = bsdf(alpha=0.2, int_ior=gray, f0=0.7, diffuse_reflectance=0.4)
+    values = {"alpha": 0.2, "int_ior": 0.3, "ext_ior": 1.0, "f0": 0.7}
+    values |= {"diffuse_reflectance": 0.4, "specular_reflectance": 1.0}
+    si = interaction(at_angle(30))
+    for name, value in values.items():
+        assert b.has_attribute(name)
+        assert_allclose(np.ravel(b.eval_attribute_1(name, si)), value, rtol=1e-6)
+        if name != "int_ior":
+            assert_allclose(np.ravel(b.eval_attribute(name, si)), value, rtol=1e-6)
+            assert_allclose(np.ravel(b.eval_attribute_3(name, si)), value, rtol=1e-6)
+    assert not b.has_attribute("reflectance")
+    if not variant.startswith("scalar"):  # an attribute of another material of the scene
+        assert np.all(np.ravel(b.eval_attribute_1("reflectance", si)) == 0)
+        assert np.all(np.ravel(b.eval_attribute("reflectance", si)) == 0)
+
+
 @in_variants
 def test_parameters_can_be_updated(variant):
     wi, wo = lobe_pairs(20, 0.3)
@@ -225,7 +283,6 @@ def test_parameters_can_be_updated(variant):
     expected = evaluate(bsdf(**values), wi, wo)
     for found, value in zip(evaluate(b, wi, wo), expected, strict=True):
         assert_allclose(found, value, rtol=1e-6)
-    assert dr.allclose(b.eval_attribute_1("int_ior", interaction(wi[0])), 2.0)
 
 
 @pytest.mark.parametrize("form", FORMS)

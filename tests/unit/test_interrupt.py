@@ -15,6 +15,7 @@ import pytest
 import mrt_mitsuba as mrt
 from mrt_mitsuba import interrupts, scene_dict
 from mrt_mitsuba.interrupts import Terminated, ending_soon
+from mrt_mitsuba.plugins.signals import left_to_other_threads
 
 
 @pytest.fixture(autouse=True)
@@ -164,3 +165,14 @@ with ending_soon(lambda: print("tidied")):
 def test_a_program_that_does_not_end_by_itself_is_ended(run_python):
     """With the code by which a shell knows the signal."""
     assert run_python(DEAF, code=128 + signal.SIGTERM).stdout == "tidied\n"
+
+
+@pytest.mark.parametrize("blocked", [set(), {signal.SIGINT}])
+def test_a_mask_of_signals_is_restored(blocked):
+    before = signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    try:
+        with left_to_other_threads():
+            assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == {signal.SIGINT}
+        assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == blocked
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -39,6 +39,7 @@ GROUP = group(
 MATTE = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
 GLOSSY = {"type": "mrt_bsdf", "alpha": 0.4, "int_ior": 1.2, "ext_ior": 1.1}
 GLOSSY |= {"diffuse_reflectance": rgb(0.1, 0.5, 0.9), "specular_reflectance": rgb(0.9, 0.3, 0.7)}
+GLOSSY["f0"] = rgb(0.9, 0.2, 0.5)
 
 
 def scene(**content: Any) -> mi.Scene:
