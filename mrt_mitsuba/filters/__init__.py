@@ -1,5 +1,6 @@
 """Filters over rendered images: pure functions from arrays to arrays, for the pictures of any renderer."""
 
+from mrt_mitsuba.filters.denoise import Denoised, denoise
 from mrt_mitsuba.filters.dof import blur_amount, gaussian_dof
 from mrt_mitsuba.filters.edges import (
     EdgeMap,
@@ -11,5 +12,5 @@ from mrt_mitsuba.filters.edges import (
     sobel_edges,
 )
 
-__all__ = ["EdgeMap", "blur_amount", "contours", "edges_image"]
+__all__ = ["Denoised", "EdgeMap", "blur_amount", "contours", "denoise", "edges_image"]
 __all__ += ["gaussian_dof", "geometry_edges", "luma_edges", "save_contours", "sobel_edges"]

@@ -153,8 +153,12 @@ def window_means(values: np.ndarray, reach: int) -> np.ndarray:
             sums = sums[..., :-step] + sums[..., step:]
             step *= 2
         wide = (sums[..., :count] + wide[..., 2 * reach :]).swapaxes(-2, -1)
-    counts = np.outer(_window_sizes(rows, reach), _window_sizes(columns, reach))
-    return wide / counts.astype(values.dtype)
+    return wide / window_counts((rows, columns), reach).astype(values.dtype)
+
+
+def window_counts(shape: tuple[int, ...], reach: int) -> np.ndarray:
+    """Number of pixels of a picture in the window of ``reach`` pixels around each, [H, W]."""
+    return np.outer(*(_window_sizes(count, reach) for count in shape))
 
 
 def _window_sizes(count: int, reach: int) -> np.ndarray:
