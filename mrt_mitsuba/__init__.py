@@ -7,13 +7,13 @@ imported with the first name that needs it. Import it before ``mitsuba`` and ``d
 from __future__ import annotations
 
 import os as _os
+from typing import TYPE_CHECKING
 
 import mrt_mitsuba.errors as _errors
 from mrt_mitsuba.errors import MrtError, MrtWarning, OutputError, SceneError, UsageError, VariantError
 
 __version__ = "0.1.0"
 
-TYPE_CHECKING = False
 if TYPE_CHECKING:
     from mrt_mitsuba import filters as filters
     from mrt_mitsuba.rendering.api import Result as Result

@@ -8,11 +8,10 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from inspect import Parameter, Signature
-from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 import drjit as dr
 import numpy as np
@@ -29,22 +28,17 @@ from mrt_mitsuba.options import Values
 from mrt_mitsuba.rendering.exposing import OWN
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, make_plan
-from mrt_mitsuba.rendering.progress import Job, Timings, default_progress
+from mrt_mitsuba.rendering.progress import Job, Progress, Timings, default_progress
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import Source, open_scene, sized
 
 log = logging.getLogger(__name__)
 Image = NDArray[np.float32]
-Options = ParamSpec("Options")
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.adaptive.error import ErrorEstimate, Round
-
-    class Render(Protocol[Options]):
-        """A function of a scene and the options of a render."""
-
-        def __call__(self, scene: Any = 0, *args: Options.args, **options: Options.kwargs) -> Result: ...
+    from mrt_mitsuba.adaptive.error import ErrorEstimate, Round, RoundPicture
+    from mrt_mitsuba.adaptive.target import Target
 
 
 @dataclass(frozen=True)
@@ -101,49 +95,75 @@ class Result:
         return images.png(self.image)
 
 
-def _with_options(settings: Callable[Options, RenderSettings]) -> Callable[[Any], Render[Options]]:
-    """Let a function of a scene and ``**options`` show them in its signature and docstring."""
-    fields = dataclasses.fields(cast(Any, settings))
-    lines = "\n".join(
-        f"        {f.name}: {f.metadata['help']} (default: {f.metadata['shown'] or f.default})."
-        for f in fields
-    )
-    scene = Parameter("scene", Parameter.POSITIONAL_OR_KEYWORD, default=0, annotation="Any")
-    named = [Parameter(f.name, Parameter.KEYWORD_ONLY, default=f.default, annotation=f.type) for f in fields]
-
-    def decorate(function: Any) -> Render[Options]:
-        function.__signature__ = Signature([scene, *named], return_annotation="Result")
-        function.__doc__ = function.__doc__.replace("        OPTIONS", lines)
-        return cast("Render[Options]", function)
-
-    return decorate
-
-
-@_with_options(RenderSettings)
-def render(scene: Any = 0, **options: Any) -> Result:
+def render(
+    scene: Any = 0,
+    *,
+    width: int | None = None,
+    height: int | None = None,
+    aa: int | None = None,
+    aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None = None,
+    target: Target | float | str | Sequence[float] | None = None,
+    maxspp: int | None = None,
+    maxseconds: float | None = None,
+    lattice: Literal["report", "centered", "film"] | None = None,
+    fresnel: Literal["schlick", "dielectric"] | None = None,
+    focaldist: float | None = None,
+    focalrange: float | None = None,
+    dof: Literal["report", "corrected"] = "report",
+    layers: Sequence[str] | str = (),
+    motion: Sequence[float] | None = None,
+    motionsamples: int = 16,
+    motionmode: Literal["frames", "stratified"] = "frames",
+    convention: Literal["report", "standard"] = "report",
+    texturing: Literal["report", "standard"] | None = None,
+    camera: Sequence[float] | None = None,
+    up: Sequence[float] | None = None,
+    fov: float | None = None,
+    light: Sequence[float] | None = None,
+    variant: str | None = None,
+    memory: int | str | None = None,
+    seed: int = 0,
+    integrator: Any = None,
+    sensor: int = 0,
+    on_round: Callable[[RoundPicture], object] | None = None,
+    spp: int | None = None,
+    count_rays: bool = False,
+    params: Mapping[str, Any] | None = None,
+    region: Sequence[int] | None = None,
+    progress: Progress | None = None,
+) -> Result:
     """Render a scene.
 
     Args:
         scene: number of a scene of the report, a ``Scene``, a Mitsuba dict, a Mitsuba scene, or the path of
             an .xml or .obj file.
-        OPTIONS
 
     A scene of one's own is rendered as Mitsuba renders it: by the rules of its film, and of its sampler where
     ``aa``, ``aamode`` and ``spp`` are left out. From ``spp=2`` on, "luma" and "sobel" know the variance of
     every pixel and ignore what noise explains; with one random ray they take noise for edges ("geometry"
-    never does). With ``target``, rays go in rounds to where they are needed.
+    never does). With ``target``, samples are allocated adaptively until the estimated error reaches it.
 
     ``motionmode="frames"`` averages ``motionsamples`` whole renders, as the report does; "stratified" is one
-    render whose rays are spread over the time while the shutter is open, that many or more in a pixel.
+    render whose samples are spread over the time while the shutter is open, that many or more in a pixel.
 
     Raises:
         UsageError: for an argument of the wrong type or range.
         SceneError: for a scene that cannot be read.
         VariantError: for a variant that cannot run here.
-    """
-    settings = RenderSettings.of(**options)
+
+    Options:"""
+    options = locals()  # first, so that it holds the arguments alone
+    scene = options.pop("scene")
+    settings = RenderSettings(**options)
     with session(settings) as job:
         return render_source(open_with(scene, settings, job), settings, job)
+
+
+if render.__doc__:  # None under ``python -OO``
+    render.__doc__ += "".join(
+        f"\n        {f.name}: {f.metadata['help']} (default: {f.metadata['shown'] or f.default})."
+        for f in dataclasses.fields(RenderSettings)
+    )
 
 
 def refuse_freezing() -> None:
@@ -161,7 +181,7 @@ def session(settings: RenderSettings) -> Iterator[Job]:
     refuse_freezing()
     with runtime.one_at_a_time.lock, held(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        budget = Budget.of(cast("int | None", settings.memory))
+        budget = Budget.of(settings.memory)
         job = Job(settings.progress or default_progress(), budget, settings.on_round)
         runtime.use(settings.variant)
         runtime.warn_if_slow()

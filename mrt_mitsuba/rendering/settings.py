@@ -1,5 +1,8 @@
-"""The options of ``mrt.render``, each declared once: its type, default, check and help are read from here by
-Python, by editors and by the command, which adds its own."""
+"""The options of ``mrt.render``: ``RenderSettings`` holds and checks them, also for the command, which adds
+its own; ``RenderOptions`` has their types for editors.
+
+A new option is a field, a type in ``RenderOptions`` and a parameter of ``render``.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import dataclasses
 import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from mrt_mitsuba.adaptive.target import Goal, Target
 from mrt_mitsuba.errors import UsageError
@@ -51,6 +54,49 @@ MAX_SPP = 4096  # of a pixel on average, where a target alone would ask for more
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
 
 
+class SharedOptions(TypedDict, total=False):
+    """The options of ``render`` that each render of a sweep may have, for type checkers."""
+
+    width: int | None
+    height: int | None
+    aa: int | None
+    aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None
+    target: Target | float | str | Sequence[float] | None
+    maxspp: int | None
+    maxseconds: float | None
+    lattice: Literal["report", "centered", "film"] | None
+    fresnel: Literal["schlick", "dielectric"] | None
+    focaldist: float | None
+    focalrange: float | None
+    dof: Literal["report", "corrected"]
+    layers: Sequence[str] | str
+    motion: Sequence[float] | None
+    motionsamples: int
+    motionmode: Literal["frames", "stratified"]
+    convention: Literal["report", "standard"]
+    texturing: Literal["report", "standard"] | None
+    camera: Sequence[float] | None
+    up: Sequence[float] | None
+    fov: float | None
+    light: Sequence[float] | None
+    variant: str | None
+    memory: int | str | None
+    seed: int
+    integrator: Any
+    sensor: int
+    on_round: Callable[[RoundPicture], object] | None
+    spp: int | None
+    count_rays: bool
+    params: Mapping[str, Any] | None
+    region: Sequence[int] | None
+
+
+class RenderOptions(SharedOptions, total=False):
+    """The options of ``render`` as type checkers see them where a function takes ``**options``."""
+
+    progress: Progress | None
+
+
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
     """The options of a render, each checked when it is given. None: the scene or the machine decides.
@@ -69,7 +115,7 @@ class RenderSettings:
         f"refine all pixels, only edges that a detector finds ({', '.join(DETECTORS)}), or where noise is",
         AAMODE,
     )
-    target: Target | float | str | Sequence[float] | None = option(
+    target: Target | tuple[float, ...] | None = option(
         None,
         TARGET,
         "error to render to: an RMSE, linear, or a percentage of the picture's mean luminance, such as 2%; "
@@ -96,10 +142,10 @@ class RenderSettings:
     dof: str = option(
         "report", choice("report", "corrected"), "depth of field as in the report, or without its flaws"
     )
-    layers: Sequence[str] = option(
+    layers: tuple[str, ...] = option(
         (), subset(LAYERS), f"further EXR layers: all, or some of {', '.join(LAYERS)}", "none"
     )
-    motion: Sequence[float] | None = option(
+    motion: tuple[float, ...] | None = option(
         None, VECTOR._replace(form="DX,DY,DZ"), "motion blur: how far the camera moves", "none"
     )
     motionsamples: int = option(
@@ -118,16 +164,16 @@ class RenderSettings:
         "textures of an OBJ file: nearest texel, or bilinear from sRGB",
         "as convention",
     )
-    camera: Sequence[float] | None = option(
+    camera: tuple[float, ...] | None = option(
         None, VECTOR, "OBJ file: where the camera is", "by the model's size"
     )
-    up: Sequence[float] | None = option(None, VECTOR, "OBJ file: what is up", "0,1,0")
+    up: tuple[float, ...] | None = option(None, VECTOR, "OBJ file: what is up", "0,1,0")
     fov: float | None = option(None, ANGLE, "OBJ file: horizontal field of view", "60")
-    light: Sequence[float] | None = option(
+    light: tuple[float, ...] | None = option(
         None, VECTOR, "OBJ file: where a white light is, in place of the two", "two, by the model's size"
     )
     variant: str | None = option(None, NAME, "Mitsuba variant", "llvm_ad_rgb, without LLVM scalar_rgb")
-    memory: int | str | None = option(
+    memory: int | None = option(
         None, BYTES, "memory to stay within: a number, with K, M, G or T for a unit", "half of what is free"
     )
     seed: int = option(0, integer(0, 2**32 - 1), "seed where anything is random")
@@ -149,10 +195,10 @@ class RenderSettings:
         "1",
     )
     count_rays: bool = option(False, SWITCH._replace(form=""), "count mirror and shadow rays")
-    params: Mapping[str, Any] | None = option(
+    params: dict[str, Any] | None = option(
         None, PARAMETERS, "values for the $names that an XML file declares, and by keys of mi.traverse"
     )
-    region: Sequence[int] | None = option(
+    region: tuple[int, ...] | None = option(
         None, RECTANGLE, "column, row, width and height of the pixels to return, as in the whole picture"
     )
     progress: Progress | None = option(

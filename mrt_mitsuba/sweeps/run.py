@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from itertools import chain
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
@@ -18,6 +18,11 @@ from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, points
 from mrt_mitsuba.sweeps.pictures import cut, is_fresh, join
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.worker import describe
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from mrt_mitsuba.rendering.settings import SharedOptions
 
 
 def sweep(
@@ -34,7 +39,7 @@ def sweep(
     png: bool = False,
     dashboard: int | None = None,
     progress: Progress | None = None,
-    **options: Any,
+    **options: Unpack[SharedOptions],
 ) -> Table:
     """Render every combination of a grid's values on several processes or machines.
 
@@ -91,7 +96,7 @@ def sweep(
     with reserved(folder) as (scratch, notes):
         table = Table(folder, named)
         table.earlier |= notes
-        planned = jobs(scene, named, options, scratch)
+        planned = jobs(scene, named, dict(options), scratch)
         whole = {job.name for job in planned if is_fresh(job, folder, table.earlier.get(job.file), png)}
         missing = [job for job in planned if not (job.name in whole and resume)]
         parts = {job.name: [job] if tiles is None else cut(job, tiles) for job in missing}

@@ -347,7 +347,7 @@ def nothing_but(says: str, **parts: Any) -> None:
     no_scene(replace(EMPTY, **parts), says)
 
 
-wrong("'widht' is not an option of render: did you mean width?", TypeError, widht=8)
+wrong("render() got an unexpected keyword argument 'widht'", TypeError, widht=8)
 wrong("there is no scene 99: choose one of 0, 1, 2, 3", scene=99)
 wrong("there is no scene -1: choose one of 0, 1, 2, 3", scene=-1)
 wrong("scene is 1.5: give a number, a Scene, a dict, a Mitsuba scene or a path", scene=1.5)

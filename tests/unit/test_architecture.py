@@ -23,6 +23,7 @@ BRANCHES = 12
 ALLOWED = {
     "mrt_mitsuba.plugins.whitted.MrtWhitted.trace",  # the camera ray and the bounces are one story
     "mrt_mitsuba.sweeps.run.sweep",  # each option has a name that editors and ``inspect`` can show
+    "mrt_mitsuba.rendering.api.render",
 }
 
 FOUNDATION = {"errors", "interrupts", "machine", "mitsuba_changes", "options", "runtime"}

@@ -11,6 +11,7 @@ from cases import Cases
 from hypothesis import given
 from hypothesis import strategies as st
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba.adaptive.target import Target
 from mrt_mitsuba.command import options, tools
 from mrt_mitsuba.command.options import Options, parse
@@ -158,3 +159,9 @@ def test_usage_names_every_option_with_its_default():
     assert all(re.search(r"\(default:\s+[^)]+\)$", entry) for entry in entries)
     assert "(default: 800)" in text
     assert "(default: from the scene)" in text
+
+
+@pytest.mark.parametrize("function", [RenderSettings.of, mrt.prepare])
+def test_an_unknown_option_is_named_with_the_nearest(function):
+    with pytest.raises(TypeError, match="did you mean width"):
+        function(widht=8)

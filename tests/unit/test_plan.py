@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.rendering.settings import TABLE, RenderSettings
+from mrt_mitsuba.rendering.settings import TABLE
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -102,14 +100,6 @@ def test_the_plan_shows_the_passes_that_run(options, passes):
     lines = str(result.plan).splitlines()
     assert "; ".join(line.removeprefix("  pass    ") for line in lines if "  pass" in line) == passes
     assert list(result.timings.passes) == [step.name for step in result.plan.passes]
-
-
-def test_settings_are_the_options_of_render():
-    """One table: what ``render`` takes is what ``RenderSettings`` checks, with the same defaults."""
-    taken = dict(inspect.signature(mrt.render).parameters)
-    assert taken.pop("scene").default == 0
-    held = {field.name: field.default for field in fields(RenderSettings)}
-    assert {name: parameter.default for name, parameter in taken.items()} == held
 
 
 UNSEEN = {"memory"}  # it decides how many rays are traced at once, which no picture shows

@@ -14,6 +14,7 @@ least-squares fit of A − B/d to the disc that has the variance of its Pascal l
 from __future__ import annotations
 
 import math
+from typing import Any, Literal
 
 import numpy as np
 
@@ -59,7 +60,11 @@ def noise(study: Study, *, quick: bool) -> None:
     flat = contrast < FLAT
     edge = contrast > EDGE
     rows = []
-    for detector, find in (("luma", filters.luma_edges), ("sobel", filters.sobel_edges)):
+    detectors: dict[Literal["luma", "sobel"], Any] = {
+        "luma": filters.luma_edges,
+        "sobel": filters.sobel_edges,
+    }
+    for detector, find in detectors.items():
         for spp in counts:
             refined = mrt.render(scene, aa=2, aamode=detector, lattice="report", spp=spp).layers["samples.Y"]
             seen = refined[1:-1, 1:-1] > 1

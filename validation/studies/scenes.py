@@ -106,7 +106,8 @@ def draw(
     """Our picture, one sample per pixel, with no path cut short."""
     settings = {"type": "mrt_whitted", "min_contribution": 0.0, **integrator}
     options: Values = {"width": size[0], "height": size[1], "aa": 1, "aamode": "none", "focaldist": 0}
-    return mrt.render(scene, **options, fresnel=fresnel, integrator=settings).image
+    options = {**options, "fresnel": fresnel, "integrator": settings}
+    return mrt.render(scene, **options).image
 
 
 def hold(study: Study, name: str, error: np.ndarray, reason: np.ndarray) -> Values:
@@ -149,7 +150,7 @@ def lattices(study: Study) -> None:
         samples = [reference_render(scene, displacement=place, **size) for place in product(places, repeat=2)]
         truth = np.mean([sample.image for sample in samples], axis=0)
         options: Values = {"aa": 2, "aamode": "none", "focaldist": 0, "fresnel": "dielectric"}
-        image = mrt.render(scene, lattice=lattice, **options, **size).image
+        image = mrt.render(scene, **{**options, "lattice": lattice}, **size).image
         error = np.quantile(abs(image - truth).max(axis=-1), 0.99)
         why = "four times what was measured; least fault: samples in other places leave 0.07"
         study.at_most(f"four samples, lattice={lattice}: difference of 99 %", error, 5e-6, why)
