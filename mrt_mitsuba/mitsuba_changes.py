@@ -24,7 +24,7 @@ import mitsuba as mi
 
 from mrt_mitsuba import plugins
 from mrt_mitsuba.interrupts import interrupt_behind
-from mrt_mitsuba.plugins.snapshot import updates
+from mrt_mitsuba.plugins.whitted.snapshot import updates
 
 Function = Callable[..., Any]
 

@@ -13,10 +13,10 @@ import mitsuba as mi
 import numpy as np
 
 from .fresnel import f0_from_ior
-from .kernel_plan import GRADIENTS, VARYING, Mirror
 from .lobes import LOBES, NUMBERS, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .variants import first, largest, plain, updatable, varies
+from .whitted.plan import GRADIENTS, VARYING, Mirror
 
 FRESNEL_FORMS = ("schlick", "dielectric", "unity")
 

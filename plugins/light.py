@@ -8,9 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .lights import towards
 from .parameters import ParameterError, spectrum, vector
 from .variants import first, is_jit, pointer, varies
+from .whitted.lights import towards
 
 
 class MrtLight(mi.Emitter):

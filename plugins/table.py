@@ -100,7 +100,7 @@ PLUGINS = (
     ),
     Plugin(
         name="mrt_whitted",
-        module="whitted",
+        module="whitted.integrator",
         class_name="MrtWhitted",
         kind="integrator",
         sample={},

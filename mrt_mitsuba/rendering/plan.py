@@ -14,8 +14,8 @@ from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.filters import dof, edges
-from mrt_mitsuba.plugins import kernel_plan
-from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
+from mrt_mitsuba.plugins.whitted import plan as kernel_plan
+from mrt_mitsuba.plugins.whitted.plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rendering.film import Film, Places, Region
 from mrt_mitsuba.rendering.settings import (
     AA,

@@ -13,7 +13,7 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import held
-from mrt_mitsuba.plugins.snapshot import Part
+from mrt_mitsuba.plugins.whitted.snapshot import Part
 from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
 from mrt_mitsuba.rendering.exposing import Exposer
 from mrt_mitsuba.rendering.film import Film

@@ -13,15 +13,16 @@ import numpy as np
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.files.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.plugins import is_known, plugin
-from mrt_mitsuba.plugins.kernel_plan import KernelPlan, SceneFacts
 from mrt_mitsuba.plugins.parameters import ParameterError
-from mrt_mitsuba.plugins.variants import ByShape, text_of
+from mrt_mitsuba.plugins.variants import text_of
+from mrt_mitsuba.plugins.whitted.plan import KernelPlan, SceneFacts
+from mrt_mitsuba.plugins.whitted.tables import ByShape
 from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.scene.open import Source
 
 if TYPE_CHECKING:
-    from mrt_mitsuba.plugins.scene_data import SceneData
-    from mrt_mitsuba.plugins.whitted import Trace
+    from mrt_mitsuba.plugins.whitted.integrator import Trace
+    from mrt_mitsuba.plugins.whitted.scene_data import SceneData
 
 
 OF_FILMS = "RGBAW"  # channels of their own, a letter each
@@ -143,7 +144,7 @@ class Shader:
         #: names of those that can be traced, without internal ones
         self.layers = frozenset(name for name, layer in TABLE.items() if layer.source == FIRST_HIT)
         self._derivatives = isinstance(integrator, mi.CppADIntegrator)  # such as prb
-        if isinstance(integrator, plugin("whitted").MrtWhitted):
+        if isinstance(integrator, plugin("whitted.integrator").MrtWhitted):
             try:
                 self._data = integrator.prepare(self.scene)
             except ParameterError as error:

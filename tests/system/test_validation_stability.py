@@ -10,7 +10,8 @@ import pytest
 from cases import Cases
 
 from mrt_mitsuba import filters
-from mrt_mitsuba.plugins import fresnel, hit_errors, lobes, microfacet
+from mrt_mitsuba.plugins import fresnel, lobes, microfacet
+from mrt_mitsuba.plugins.whitted import hit_errors
 from mrt_mitsuba.validation.studies import stability
 from mrt_mitsuba.validation.study import findings
 

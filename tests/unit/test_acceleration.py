@@ -12,9 +12,9 @@ import pytest
 from nodes import group
 from numpy.testing import assert_array_equal
 
-from mrt_mitsuba.plugins.point_buffer import PointBuffer
-from mrt_mitsuba.plugins.quadrics import Quadrics
-from mrt_mitsuba.plugins.simple_shapes import Spheres
+from mrt_mitsuba.plugins.whitted.buffers import PointBuffer
+from mrt_mitsuba.plugins.whitted.quadrics import Quadrics
+from mrt_mitsuba.plugins.whitted.shapes import Spheres
 
 pytestmark = pytest.mark.usefixtures("variant")
 

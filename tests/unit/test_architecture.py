@@ -21,7 +21,7 @@ LINES = 60
 PARAMETERS = 8
 BRANCHES = 12
 ALLOWED = {
-    "mrt_mitsuba.plugins.whitted.MrtWhitted.trace",  # the camera ray and the bounces are one story
+    "mrt_mitsuba.plugins.whitted.integrator.MrtWhitted._trace",  # the camera ray and the bounces together
     "mrt_mitsuba.sweeps.run.sweep",  # each option has a name that editors and ``inspect`` can show
     "mrt_mitsuba.rendering.api.render",
 }

@@ -13,8 +13,8 @@ import pytest
 from cases import Cases
 from nodes import group, mesh, rgb, sensor
 
-from mrt_mitsuba.plugins.kernel_plan import RULES, KernelPlan, contents
 from mrt_mitsuba.plugins.table import names_in
+from mrt_mitsuba.plugins.whitted.plan import RULES, KernelPlan, contents
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -13,11 +13,11 @@ from nodes import documented, example, sensor
 from numpy.testing import assert_allclose
 
 from mrt_mitsuba import plugins
-from mrt_mitsuba.plugins import facts
 from mrt_mitsuba.plugins.lobes import LOBES, Lobes, Pair
-from mrt_mitsuba.plugins.materials import material_rows
-from mrt_mitsuba.plugins.snapshot import Kept, Snapshot
 from mrt_mitsuba.plugins.table import PLUGINS, Plugin, names_in
+from mrt_mitsuba.plugins.whitted import facts
+from mrt_mitsuba.plugins.whitted.materials import material_rows
+from mrt_mitsuba.plugins.whitted.snapshot import Kept, Snapshot
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -173,7 +173,7 @@ def test_reasons_name_the_plugins_of_the_table():
 def test_lobes_may_share_a_flag(monkeypatch):
     """Bits that were added up made a third flag: of three lobes without one, light was missing."""
     from mrt_mitsuba.plugins import lobes as module
-    from mrt_mitsuba.plugins import scene_data
+    from mrt_mitsuba.plugins.whitted import scene_data
 
     class Sheen:
         name = "sheen"

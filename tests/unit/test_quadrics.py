@@ -17,7 +17,7 @@ from nodes import group
 from mrt_mitsuba.plugins import intersect
 from mrt_mitsuba.plugins.intersect import BASE, LATERAL, TOP
 from mrt_mitsuba.plugins.quadric_kinds import KINDS
-from mrt_mitsuba.plugins.quadrics import Quadrics
+from mrt_mitsuba.plugins.whitted.quadrics import Quadrics
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Scene
 from mrt_mitsuba.validation.oracles import reference
 

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.plugins.variants import aligned
+from mrt_mitsuba.plugins.whitted.tables import aligned
 
 Array = np.ndarray
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32

@@ -12,11 +12,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import is_known, plugin
-from .kernel_plan import SCALAR_VARIANT
-from .lobes import LOBES, NUMBERS, Lobes
-from .table import names_in
-from .variants import ByShape, is_jit, varies
+from .. import is_known, plugin
+from ..lobes import LOBES, NUMBERS, Lobes
+from ..table import names_in
+from ..variants import is_jit, varies
+from .plan import SCALAR_VARIANT
+from .tables import ByShape
 
 
 def material_rows(shapes: Sequence[mi.Shape]) -> tuple[list[np.ndarray], str]:

@@ -15,14 +15,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..parameters import LARGEST, ParameterError, PluginError, choice, flag, integer, number, spectrum
+from ..signals import left_to_other_threads
+from ..variants import but_not, construct_quietly, largest
+from .buffers import PointBuffer
 from .facts import Reading
-from .kernel_plan import BUDGETS, KernelPlan, SceneFacts, make_plan
-from .parameters import LARGEST, ParameterError, PluginError, choice, flag, integer, number, spectrum
-from .point_buffer import PointBuffer
+from .plan import BUDGETS, KernelPlan, SceneFacts, make_plan
 from .scene_data import Hit, SceneData
-from .signals import left_to_other_threads
 from .snapshot import Kept, Snapshot
-from .variants import but_not, construct_quietly, largest
 
 # A sixteenth of a step of an 8-bit picture: the sum of many cut paths stays below half a step, and on average
 # over the report's scenes below 1e-5

@@ -9,12 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .intersect import intersect_plane
+from ..intersect import intersect_plane
+from ..variants import first, put_where
 from .snapshot import parameters_of
-from .variants import ByShape, Table, first, put_where, shape_at, shape_ids
+from .tables import ByShape, Table, shape_at, shape_ids
 
 if TYPE_CHECKING:
-    from .plane import MrtPlane
+    from ..plane import MrtPlane
 
 
 class Planes:

@@ -19,8 +19,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .intersect import off_zero
-from .variants import aligned
+from ..intersect import off_zero
+from .tables import aligned
 
 # Box tests are wider than exact by some float32 roundings, relative to distances and to coordinates
 _SLACK = 8 * 2.0**-24

@@ -12,8 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import is_known, plugin
-from .variants import Table, is_jit, largest, pointer
+from .. import is_known, plugin
+from ..variants import is_jit, largest, pointer
+from .tables import Table
 
 
 def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:

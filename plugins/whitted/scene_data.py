@@ -13,20 +13,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..lobes import LOBES, Pair
+from ..variants import but_not, is_jit
+from .buffers import PointBuffer
 from .facts import Reading
 from .hit_errors import HitErrors
-from .kernel_plan import KernelPlan
 from .lights import Lights
-from .lobes import LOBES, Pair
 from .materials import MaterialTable, has_mirror
-from .point_buffer import PointBuffer
+from .plan import KernelPlan
 from .quadrics import Quadrics
-from .simple_shapes import Planes, Spheres
+from .shapes import Planes, Spheres
 from .snapshot import Kept
-from .variants import but_not, is_jit
 
 # Shadow rays end this share of their way short of a light: one that lies on a surface shines to both sides
 TOUCHING = 2.0**-14
+
+PLUGINS = __name__.removesuffix("whitted.scene_data")  # how the names of our modules begin
 
 # Reach of a mirror ray: any number that float32 holds
 FARTHEST = 2.0**127
@@ -290,7 +292,7 @@ def _arrays_in(value: Any) -> list[Any]:
         return []
     if dr.is_array_v(value):
         return [value] if dr.width(value) else []  # Dr.Jit aborts on an array of nothing
-    if type(value).__module__.startswith(f"{__package__}.") and hasattr(value, "__dict__"):
+    if type(value).__module__.startswith(PLUGINS) and hasattr(value, "__dict__"):
         value = vars(value)
     if isinstance(value, dict):
         value = value.values()

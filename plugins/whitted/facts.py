@@ -8,15 +8,15 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from . import classes_of, is_known
-from .kernel_plan import Mirror, SceneFacts
+from .. import classes_of, is_known
+from ..lobes import LOBES
+from ..parameters import ParameterError
+from ..variants import is_jit
 from .lights import brightness, light_rows
-from .lobes import LOBES
 from .materials import has_mirror, is_mrt_bsdf, is_oriented, is_textured, material_rows
-from .parameters import ParameterError
-from .simple_shapes import is_sphere
+from .plan import Mirror, SceneFacts
+from .shapes import is_sphere
 from .snapshot import Kept, Snapshot
-from .variants import is_jit
 
 # Beyond these sizes, Embree's products of three lengths leave float32
 SMALLEST_MESH = 1e-8

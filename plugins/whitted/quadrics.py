@@ -9,15 +9,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .intersect import LATERAL, Frame
-from .point_buffer import PointBuffer
-from .quadric_kinds import KINDS
+from ..intersect import LATERAL, Frame
+from ..quadric_kinds import KINDS
+from ..variants import is_jit, put_where
+from .buffers import PointBuffer
+from .tables import Table, shape_at, shape_ids
 from .tree import Tree
-from .variants import Table, is_jit, put_where, shape_at, shape_ids
 
 if TYPE_CHECKING:
-    from .axial import AxialMesh
-    from .group import MrtGroup
+    from ..axial import AxialMesh
+    from ..group import MrtGroup
 
 
 class Quadrics:

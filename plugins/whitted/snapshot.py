@@ -25,8 +25,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import is_known, plugin
-from .variants import is_jit
+from .. import is_known, plugin
+from ..variants import is_jit
 
 Value = TypeVar("Value")
 MOST_NOTED = 2**16  # objects of which it is known when they were updated

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from .table import names_in
+from ..table import names_in
 
 # Up to this many lights the kernel holds the code of each; beyond, it loops over them
 UNROLLED_LIGHTS = 8

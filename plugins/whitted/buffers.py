@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .variants import aligned
+from .tables import aligned
 
 # With more cells, or more objects in all of them, lists would take more memory and time than they save
 MOST_CELLS = 2**21

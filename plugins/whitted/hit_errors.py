@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .mesh_api import triangles
-from .variants import ByShape
+from ..mesh_api import triangles
+from .tables import ByShape
 
 # What a curved surface's hit, projection and ray test lose, in roundings of the largest coordinate
 CURVED = 32 * 2.0**-24
