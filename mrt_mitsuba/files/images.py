@@ -8,13 +8,14 @@ import os
 import stat
 import sys
 from collections import namedtuple
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import OutputError, UsageError, warn
 from mrt_mitsuba.files.layers import LAYERS
 from mrt_mitsuba.files.replacing import replacing
+from mrt_mitsuba.interrupts import heed, held
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.options import StrPath, Values, check, choice
 
@@ -27,10 +28,9 @@ if TYPE_CHECKING:
 # For zlib to look for runs only: as fast as its level 1, and 161 kB for scene 3 in place of 206
 PNG_RUNS = 3
 
-# Smaller pictures are not compressed, which would take several times as long as all other writing, to save
-# a third of the bytes, or two where there is much sky: the last digits of colours are noise
-COMPRESSED = 2**20  # pixels
+MAX_EXR_NAME = 255  # bytes of the name of a channel or an attribute; the library cuts longer ones
 
+COMPRESSION = choice("zip", "none")
 TONEMAP = choice("report", "srgb")
 _PIXELS = 2**14  # converted to 8 bit at a time, so that intermediate arrays stay in the processor's cache
 
@@ -47,19 +47,22 @@ def save(
     layers: Mapping[str, Image] | None = None,
     header: Values | None = None,
     tonemap: str = "report",
+    compression: str = "zip",
     inputs: Iterable[StrPath] = (),
 ) -> None:
     """Write a linear picture [H, W, 3] in the formats that the endings of ``paths`` name, .png or .exr.
 
-    All files are replaced, or none. Layers and header go into an EXR only, ``tonemap`` (see ``to_8bit``)
-    concerns a PNG only. A layer is named by one channel ("depth.Z", [H, W]) or as a whole ("depth", [H, W];
-    "normal", [H, W, 3]), with the channels of ``LAYERS``, else R, G, B or Y. Header values are text or
-    numbers; anything else is written as JSON. ``inputs``: files that the picture is made from.
+    All files are replaced, or none. Layers, header and ``compression`` ("zip", lossless, or "none") are for
+    EXR files, ``tonemap`` (see ``to_8bit``) for PNG files. A layer is named by one channel ("depth.Z",
+    [H, W]) or as a whole ("depth", [H, W]; "normal", [H, W, 3]), with the channels of ``LAYERS``, else R, G,
+    B or Y. Header values are text or numbers; anything else is written as JSON. ``inputs``: files that the
+    picture is made from.
 
-    Raises ``OutputError`` for a file that cannot be written, or that is one of ``inputs``; ``UsageError``
-    without a name.
+    Raises ``OutputError`` for a file that cannot be written, or that is one of ``inputs``, and for pixels,
+    names or values that a picture cannot hold; ``UsageError`` without a name of a file.
     """
     check("tonemap", TONEMAP, tonemap)
+    check("compression", COMPRESSION, compression)
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not paths:
         raise UsageError('save: give the name of a file, such as "out.exr"')
@@ -75,7 +78,7 @@ def save(
             if ending == ".png":
                 _write_png(file, image, tonemap)
             else:
-                _write_exr(file, image, layers or {}, header or {})
+                _write_exr(file, image, layers or {}, header or {}, compression)
 
 
 def write_png(path: StrPath, image: Image, *, tonemap: str = "report") -> None:
@@ -92,12 +95,34 @@ def write_exr(
 ) -> None:
     """Write a linear picture [H, W, 3] as float32 EXR, whatever the path's ending; see ``save``."""
     with replacing(path) as (file,):
-        _write_exr(file, image, layers or {}, header or {})
+        _write_exr(file, image, layers or {}, header or {}, "zip")
+
+
+def _floats(values: Any, what: str) -> Image:
+    """Return values as a float32 array; raise ``OutputError`` where they are no numbers."""
+    import numpy as np
+
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError("they are complex")
+        with np.errstate(over="ignore"):  # beyond float32 is infinite
+            return np.asarray(values, np.float32)
+    except (TypeError, ValueError) as error:
+        raise OutputError(f"{what} is no array of numbers: {error}") from error
+
+
+def _picture(image: Any) -> Image:
+    """Return a picture as float32 [H, W, 3]; raise ``OutputError`` if it is none."""
+    picture = _floats(image, "the picture")
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
+        raise OutputError(f"the picture has shape {picture.shape}; expected [H, W, 3], not empty")
+    return picture
 
 
 def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
     from PIL import Image as PilImage
 
+    image = _picture(image)
     height, width = image.shape[:2]
     picture = PilImage.new("RGB", (width, height))
     for row, block in _blocks(image, tonemap):
@@ -105,17 +130,18 @@ def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
     picture.save(file, format="PNG", compress_type=PNG_RUNS)
 
 
-def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Values) -> None:
-    """Write the picture [H, W, 3] and its layers, [H, W] for each channel; arrays are copied only where the
-    library would. Raises ``OutputError`` if a shape does not fit."""
+def _write_exr(
+    file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Values, compression: str
+) -> None:
+    """Write the picture [H, W, 3] and its layers; arrays are copied only where the library would."""
     import numpy as np
     import OpenEXR
 
-    planes = {"RGB": np.ascontiguousarray(image, np.float32)}
-    if planes["RGB"].shape[2:] != (3,):
-        raise OutputError(f"the picture has shape {planes['RGB'].shape}; expected [H, W, 3]")
-    for name, array in layers.items():
-        array = np.atleast_3d(np.asarray(array, np.float32))
+    planes = {"RGB": np.ascontiguousarray(_picture(image))}
+    for name in (*layers, *header):
+        _check_name(name)
+    for name, values in layers.items():
+        array = np.atleast_3d(_floats(values, f"layer {name}"))
         letters = "RGB" if array.shape[2] == 3 else "Y"
         if name in LAYERS:
             letters = LAYERS[name].letters
@@ -125,35 +151,93 @@ def _write_exr(file: IO[bytes], image: Image, layers: Mapping[str, Image], heade
         if array.shape != (*planes["RGB"].shape[:2], len(names)):
             raise OutputError(f"layer {name} of shape {array.shape} is no {' '.join(names)} of the picture")
         planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}
-    plain = (str, int, float)
-    texts = {k: v if isinstance(v, plain) else json.dumps(v) for k, v in header.items()}
+    for name in planes:
+        _check_name(name)
+    attributes = {name: _attribute(name, value) for name, value in header.items()}
+    raised: list[BaseException] = []
 
-    # The library does not report a full disk when it opens the file itself, so the file is ours. It writes a
-    # few rows at a time by code in Python: within its own code, and that of Python's files, a signal would
-    # wait until all is written.
-    def write(rows: bytes) -> int:
-        return file.write(rows)
+    def remembering(call: Callable[..., int], stops: bool) -> Callable[..., int]:
+        """Return a method of the file that keeps what it raises, and raises it only if it ``stops``.
 
-    stream = SimpleNamespace(tell=file.tell, seek=file.seek, write=write)
-    with compressing(image.shape[0] * image.shape[1]) as kind:
-        OpenEXR.File({**texts, "compression": kind, "type": OpenEXR.scanlineimage}, planes).write(stream)
+        In its destructor, where it writes the table of offsets, the library ignores what ``write`` raises,
+        and ends the process for what ``seek`` or ``tell`` raise. After a fault, nothing is written.
+        """
+
+        def run(*arguments: Any) -> int:
+            if not raised:
+                try:
+                    heed()
+                    return call(*arguments)
+                except BaseException as error:
+                    raised.append(error)
+                    if stops:
+                        raise
+            return 0
+
+        return run
+
+    # A stream in Python, as the library does not report a full disk when it opens the file itself
+    methods = {name: remembering(getattr(file, name), name == "write") for name in ("tell", "seek", "write")}
+    stream = SimpleNamespace(**methods)
+    kind = OpenEXR.ZIP_COMPRESSION if compression == "zip" else OpenEXR.NO_COMPRESSION
+    with held(), exr_threads():
+        try:
+            exr = OpenEXR.File({**attributes, "compression": kind, "type": OpenEXR.scanlineimage}, planes)
+            exr.write(stream)
+        except (RuntimeError, TypeError, ValueError) as error:
+            if not raised:
+                raise OutputError(f"not a picture that an EXR can hold: {error}") from error
+        if raised:
+            raise raised[0]
+
+
+def _check_name(name: Any) -> None:
+    """Raise ``OutputError`` for a name of a channel or an attribute that an EXR would cut or refuse."""
+    try:
+        size = 0 if "\0" in name else len(name.encode())
+    except (TypeError, ValueError):  # no text, or a lone surrogate
+        size = 0
+    if not 0 < size <= MAX_EXR_NAME:
+        shown = f"{name!r:.60}"
+        raise OutputError(f"{shown} is no name that an EXR can hold: text of 1 to {MAX_EXR_NAME} bytes")
+
+
+def _attribute(name: str, value: Any) -> str | int | float:
+    """Return a header value as an EXR holds it: text and numbers as they are, anything else as JSON."""
+    import numpy as np
+
+    def plain(part: Any) -> Any:
+        """Return a part that JSON does not know as numbers, or as text where it has a text of its own."""
+        numbers = np.asarray(part)
+        if numbers.dtype.kind in "biuf":
+            return numbers.tolist()
+        text = str(part)
+        if isinstance(part, bytes) or " at 0x" in text:  # an address, another one each time
+            raise TypeError(f"{type(part).__name__} {text:.60}")
+        return text
+
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, float) or (isinstance(value, int) and -(2**31) <= value < 2**31):
+        return value
+    try:
+        text = value if isinstance(value, str) else json.dumps(value, default=plain)
+    except (TypeError, ValueError) as error:
+        raise OutputError(f"header {name}: neither text nor numbers nor JSON can hold {error}") from error
+    return text.encode(errors="backslashreplace").decode()
 
 
 @contextlib.contextmanager
-def compressing(pixels: int) -> Iterator[Any]:
-    """Let the EXR library compress in threads, to the same file; yield the kind of compression to use.
+def exr_threads() -> Iterator[None]:
+    """Let the EXR library compress in threads, to the same file.
 
-    The threads are gone afterwards: a process that is forked while it has some waits for them for ever.
+    The threads are gone afterwards: a process that is forked while it has some deadlocks.
     """
     import OpenEXR
 
-    if pixels < COMPRESSED:
-        yield OpenEXR.NO_COMPRESSION
-        return
     before = OpenEXR.global_thread_count()
     OpenEXR.set_global_thread_count(usable_cores())
     try:
-        yield OpenEXR.ZIP_COMPRESSION
+        yield
     finally:
         OpenEXR.set_global_thread_count(before)
 

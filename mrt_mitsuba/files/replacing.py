@@ -102,7 +102,12 @@ def _explained(*paths: StrPath) -> Iterator[None]:
 def _target(path: StrPath, inputs: Iterable[StrPath]) -> str:
     """The real path to write; ``OutputError`` where replacing a file would be wrong."""
     name = os.fspath(path)
-    if "\0" in name or os.path.basename(name) in ("", ".", ".."):
+    try:
+        os.fsencode(name)
+        named = "\0" not in name and os.path.basename(name) not in ("", ".", "..")
+    except UnicodeEncodeError:  # a lone surrogate
+        named = False
+    if not named:
         raise OutputError(f"cannot write {name!r}: it names no file")
     target = os.path.realpath(name)
     folder = os.path.dirname(target)

@@ -58,14 +58,21 @@ class Result:
     error: ErrorEstimate | None = None  #: to the converged picture; None where nothing was estimated
     rounds: tuple[Round, ...] = ()  #: what was known after each: the error over the time of this render
 
-    def save(self, *paths: str | os.PathLike[str], tonemap: str = "report") -> None:
+    def save(self, *paths: str | os.PathLike[str], tonemap: str = "report", compression: str = "zip") -> None:
         """Write .png and .exr files, all or none; raise ``OutputError``, also for a file that the scene was
         read from.
 
-        ``tonemap`` ("report" or "srgb") concerns a PNG only.
+        ``tonemap`` ("report" or "srgb") is for PNG files, ``compression`` ("zip" or "none") for EXR.
         """
-        header = self.header()
-        images.save(paths, self.image, layers=self.layers, header=header, tonemap=tonemap, inputs=self.inputs)
+        images.save(
+            paths,
+            self.image,
+            layers=self.layers,
+            header=self.header(),
+            tonemap=tonemap,
+            compression=compression,
+            inputs=self.inputs,
+        )
 
     def header(self) -> dict[str, Any]:
         """The header attributes of an EXR: how the picture was made, and nothing such as seconds that changes

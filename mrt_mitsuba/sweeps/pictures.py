@@ -20,7 +20,7 @@ import OpenEXR
 from PIL import Image
 
 from mrt_mitsuba.errors import MrtError, OutputError, UsageError
-from mrt_mitsuba.files.images import compressing, silenced
+from mrt_mitsuba.files.images import exr_threads, silenced
 from mrt_mitsuba.files.replacing import replacing
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.open import open_scene
@@ -146,7 +146,8 @@ def _write_rows(job: Job, tiles: Sequence[Job], folder: str) -> None:
     columns = [region[1] for region in regions].count(0)  # those in the first row
     with replacing(os.path.join(folder, job.file)) as (file,):
         with contextlib.ExitStack() as stack:
-            kind = stack.enter_context(compressing((left + wide) * (top + high)))
+            kind = OpenEXR.ZIP_COMPRESSION
+            stack.enter_context(exr_threads())
             header["compression"] = type(header["compression"])(int(kind))  # an older type of the library
             picture = stack.enter_context(contextlib.closing(OpenEXR.OutputFile(file.name, header)))
             for first in range(0, len(files), columns):
