@@ -133,25 +133,11 @@ def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
 def _write_exr(
     file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Values, compression: str
 ) -> None:
-    """Write the picture [H, W, 3] and its layers; arrays are copied only where the library would."""
-    import numpy as np
+    """Write the picture [H, W, 3] and its layers."""
     import OpenEXR
 
-    planes = {"RGB": np.ascontiguousarray(_picture(image))}
-    for name in (*layers, *header):
-        _check_name(name)
-    for name, values in layers.items():
-        array = np.atleast_3d(_floats(values, f"layer {name}"))
-        letters = "RGB" if array.shape[2] == 3 else "Y"
-        if name in LAYERS:
-            letters = LAYERS[name].letters
-        names = [f"{name}.{letter}" for letter in letters]
-        if "." in name or name == "A":  # a channel by itself
-            names = [name]
-        if array.shape != (*planes["RGB"].shape[:2], len(names)):
-            raise OutputError(f"layer {name} of shape {array.shape} is no {' '.join(names)} of the picture")
-        planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}
-    for name in planes:
+    planes = _planes(image, layers)
+    for name in (*planes, *header):
         _check_name(name)
     attributes = {name: _attribute(name, value) for name, value in header.items()}
     raised: list[BaseException] = []
@@ -178,17 +164,36 @@ def _write_exr(
 
     # A stream in Python, as the library does not report a full disk when it opens the file itself
     methods = {name: remembering(getattr(file, name), name == "write") for name in ("tell", "seek", "write")}
-    stream = SimpleNamespace(**methods)
     kind = OpenEXR.ZIP_COMPRESSION if compression == "zip" else OpenEXR.NO_COMPRESSION
     with held(), exr_threads():
         try:
             exr = OpenEXR.File({**attributes, "compression": kind, "type": OpenEXR.scanlineimage}, planes)
-            exr.write(stream)
+            exr.write(SimpleNamespace(**methods))
         except (RuntimeError, TypeError, ValueError) as error:
             if not raised:
                 raise OutputError(f"not a picture that an EXR can hold: {error}") from error
         if raised:
             raise raised[0]
+
+
+def _planes(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
+    """Return the picture as "RGB" and a plane [H, W] for each channel; copied only where the library would."""
+    import numpy as np
+
+    planes = {"RGB": np.ascontiguousarray(_picture(image))}
+    for name, values in layers.items():
+        _check_name(name)
+        array = np.atleast_3d(_floats(values, f"layer {name}"))
+        letters = "RGB" if array.shape[2] == 3 else "Y"
+        if name in LAYERS:
+            letters = LAYERS[name].letters
+        names = [f"{name}.{letter}" for letter in letters]
+        if "." in name or name == "A":  # a channel by itself
+            names = [name]
+        if array.shape != (*planes["RGB"].shape[:2], len(names)):
+            raise OutputError(f"layer {name} of shape {array.shape} is no {' '.join(names)} of the picture")
+        planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}
+    return planes
 
 
 def _check_name(name: Any) -> None:
