@@ -177,7 +177,7 @@ def _write_exr(
 
 
 def _planes(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
-    """Return the picture as "RGB" and a plane [H, W] for each channel; copied only where the library would."""
+    """Return the picture as "RGB" and [H, W] for each channel, copied only where the library would."""
     import numpy as np
 
     planes = {"RGB": np.ascontiguousarray(_picture(image))}

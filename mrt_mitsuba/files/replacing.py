@@ -94,20 +94,16 @@ def temporary_folder(folder: StrPath, prefix: str) -> Iterator[str]:
 def _explained(*paths: StrPath) -> Iterator[None]:
     try:
         yield
-    except OSError as error:
+    except (OSError, UnicodeEncodeError) as error:  # a lone surrogate in a name
         names = " and ".join(os.fspath(path) for path in paths)
-        raise OutputError(f"cannot write {names}: {error.strerror or error}") from error
+        why = getattr(error, "strerror", None) or error
+        raise OutputError(f"cannot write {names}: {why}") from error
 
 
 def _target(path: StrPath, inputs: Iterable[StrPath]) -> str:
     """The real path to write; ``OutputError`` where replacing a file would be wrong."""
     name = os.fspath(path)
-    try:
-        os.fsencode(name)
-        named = "\0" not in name and os.path.basename(name) not in ("", ".", "..")
-    except UnicodeEncodeError:  # a lone surrogate
-        named = False
-    if not named:
+    if "\0" in name or os.path.basename(name) in ("", ".", ".."):
         raise OutputError(f"cannot write {name!r}: it names no file")
     target = os.path.realpath(name)
     folder = os.path.dirname(target)

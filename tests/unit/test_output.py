@@ -132,7 +132,7 @@ targets("/dev/full", "not a regular file")
 targets("a" * 300 + ".png", "name too long")
 targets("a\0.png", "names no file")
 targets("..", "names no file")
-targets("\ud800.png", "names no file")
+targets("\ud800.png", "surrogates not allowed")
 
 
 @pytest.mark.parametrize(("name", "reason"), targets)
