@@ -345,7 +345,7 @@ def _runner(scene: Given, shared: Options) -> Run:
         loadable = isinstance(one, dict) or is_path(one, ".xml")
         if loadable and given["variant"] == variant and "params" not in given:
             if id(one) not in loaded:
-                loaded[id(one)] = open_scene(one).scene
+                loaded[id(one)] = open_scene(one, integrator=given.get("integrator")).scene
             one = loaded[id(one)]
         return render(one, **given)
 

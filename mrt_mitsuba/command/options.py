@@ -12,7 +12,7 @@ from typing import Any
 from mrt_mitsuba.command.registry import split
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.files.images import TONEMAP
-from mrt_mitsuba.options import SWITCH, Kind, check, choice, either, is_obj, option, table
+from mrt_mitsuba.options import SWITCH, Kind, check, choice, either, is_obj, is_path, option, table
 from mrt_mitsuba.rendering import settings
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.report import NUMBERS
@@ -88,16 +88,11 @@ def parse(arguments: Sequence[str]) -> Options:
             form = TABLE[needed].metadata["kind"].form
             raise UsageError(f"{name} is of use only with {needed}={form.lower()}")
         values[name] = check(name, TABLE[name].metadata["kind"], text, text=True)
-    if params:
-        from mrt_mitsuba.scene.files import declared
-
-        scene = str(values.get("scene", ""))
-        known = declared(scene) if scene.lower().endswith(".xml") else {}
-        if unknown := params.keys() - known.keys():
-            strange = min(unknown)
-            close = difflib.get_close_matches(strange.lstrip("-").lower(), [*TABLE, *known], n=1)
-            hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
-            raise UsageError(f"unknown option {strange!r}.{hint}")
+    if params and not is_path(values.get("scene"), ".xml"):  # whose parameters are checked as it is read
+        strange = min(params)
+        close = difflib.get_close_matches(strange.lstrip("-").lower(), TABLE, n=1)
+        hint = f" Did you mean {close[0]}?" if close else " 'mrt help' lists the options."
+        raise UsageError(f"unknown option {strange!r}.{hint}")
     options = Options(**values, params=params or None)
     is_obj(options.scene, options.model())
     return options

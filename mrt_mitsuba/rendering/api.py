@@ -163,7 +163,7 @@ def render(
     scene = options.pop("scene")
     settings = RenderSettings(**options)
     with session(settings) as job:
-        return render_source(open_with(scene, settings, job), settings, job)
+        return render_source(open_with(scene, settings, job.budget), settings, job)
 
 
 if render.__doc__:  # None under ``python -OO``
@@ -195,18 +195,13 @@ def session(settings: RenderSettings) -> Iterator[Job]:
         yield job
 
 
-def open_with(scene: Any, settings: RenderSettings, job: Job) -> Source:
+def open_with(scene: Any, settings: RenderSettings, budget: Budget) -> Source:
     """Load a scene as the options of a render say; see ``render`` for what it may be."""
-    return open_scene(
-        scene,
-        size=(settings.width, settings.height),
-        fresnel=settings.fresnel,
-        integrator=settings.integrator,
-        budget=job.budget,
-        sensor=settings.sensor,
-        params=settings.params,
-        model=settings.model(),
-    )
+    given = {
+        field.name: value if (value := getattr(settings, field.name)) is not field.default else None
+        for field in dataclasses.fields(settings)
+    }
+    return open_scene(scene, budget=budget, **{**given, "sensor": settings.sensor})
 
 
 def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:

@@ -104,12 +104,6 @@ def warn_of(findings: Mapping[str, list[str]]) -> None:
             warn(f"{texts[0]}{more}")
 
 
-def declared(path: str) -> dict[str, str]:
-    """The parameters that an XML file declares, with their defaults. Raises ``SceneError``."""
-    defaults = [attributes for tag, attributes in elements(path) if tag == "default"]
-    return {each.get("name", ""): each.get("value", "") for each in defaults}
-
-
 def elements(file: str) -> list[tuple[str, dict[str, str]]]:
     """Tag and attributes of each element of an XML file, in order."""
     from xml.parsers import expat

@@ -14,9 +14,12 @@ limit of the stack, and Dr.Jit's messages may wait for each other for ever; one 
 from __future__ import annotations
 
 import contextlib
+import difflib
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import mitsuba as mi
 
@@ -27,6 +30,9 @@ from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home, two_threads
 from mrt_mitsuba.options import Values
 from mrt_mitsuba.scene.files import DEEPEST, elements, picture_size, require_file
 
+DEEPEST_INCLUDE = 15  # files that include each other; Mitsuba refuses more
+MOST_INCLUDES = 1000
+LONGEST_SUBSTITUTION = 2**24  # characters that parameters of a file come to in all
 MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
 _PICTURES = ("mrt_texture", "bitmap", "envmap")  # plugins that read one
 
@@ -39,44 +45,66 @@ _ORIGIN = re.compile(
 
 
 def load_dict(
-    scene: Values, name: str = "the dict", budget: Budget | None = None, *, merge: bool = True
+    scene: Values,
+    name: str = "the dict",
+    budget: Budget | None = None,
+    *,
+    merge: bool = True,
+    keys: Values | None = None,
 ) -> mi.Object:
     """Load a Mitsuba dict: a scene, or any other object.
 
-    ``merge``: make one of meshes of the same material, as Mitsuba does, which leaves them in any order.
-    Raises ``SceneError`` that calls it ``name``, and ``UsageError`` for a texture too large for the budget.
+    ``merge``: make one of meshes of the same material, as Mitsuba does, which leaves them in any order;
+    ``keys``: values by keys such as ``ball.center``, see ``_instantiate``.
+    Raises ``SceneError`` that calls it ``name``, and ``UsageError`` for an unknown key, a value of the wrong
+    type, or a texture too large for the budget.
     """
     budget = budget or Budget.of(None)
     with _loading(name):
         _check_dict(scene, budget.inputs)
         state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)
         _check_nodes(state.nodes, budget)
-        return _instantiate(state, merge)
+        return _instantiate(state, merge, keys or {})
 
 
 def load_file(
-    path: str, parameters: Values, budget: Budget | None = None, *, as_text: bool = False
+    path: str,
+    params: Values,
+    budget: Budget | None = None,
+    *,
+    options: Values | None = None,
+    as_text: bool = False,
 ) -> tuple[mi.Object | str, Mapping[str, str]]:
     """The scene of an XML file, and its ``$parameters`` with the values given, or the defaults.
 
+    ``params``: values by the names of parameters, and by keys such as ``ball.center``; ``options``: those of
+    a render, whose values are used for parameters of the same names, and None for those not given.
     ``as_text``: return it as XML, with includes and parameters filled in, and files by their whole path.
-    Raises ``SceneError``, and ``UsageError`` for another kind of file or a texture too large for the budget.
+
+    Raises ``SceneError``, and ``UsageError`` for another kind of file, a parameter or key that is not in it,
+    or a texture too large for the budget.
     """
     require_file(path)
     if not path.lower().endswith(".xml"):
         raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
     budget = budget or Budget.of(None)
-    given = {key: str(value) for key, value in parameters.items()}
+    keys = {key: value for key, value in params.items() if "." in key}
+    given = {name: str(value) for name, value in params.items() if name not in keys}
     with _loading(path, os.path.dirname(path) or "."):
-        values = _check_xml(path, given, budget.inputs)
-        state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), path, **given)
+        xml = XmlParameters(given, options or {}, budget.inputs)
+        xml.read(path)
+        xml.check(path)
+        passed = {name: xml.values[name] for name in xml.used - xml.declared}
+        state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), path, **passed)
         _check_nodes(state.nodes, budget)
         if not as_text:
-            return _instantiate(state), values
+            return _instantiate(state, True, keys), xml.values
         for node in state.nodes:
             if isinstance(node.props.get("filename", None), str):
                 node.props["filename"] = os.path.abspath(_resolved(node.props["filename"]))
-        return mi.parser.write_string(state), values
+        if strange := _set_stated(state, keys):
+            raise UsageError(f"{path} does not state {min(strange)}: write it into the file")
+        return mi.parser.write_string(state), xml.values
 
 
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------
@@ -99,13 +127,87 @@ def _check_nodes(nodes: Iterable[mi.parser.SceneNode], budget: Budget) -> None:
                 budget.take_texture(file, *size, around=kind == "envmap")
 
 
-def _instantiate(state: mi.parser.ParserState, merge: bool = True) -> mi.Object:
+def _instantiate(state: mi.parser.ParserState, merge: bool, keys: Values) -> mi.Object:
+    """Make the objects, with values set by keys: of what the scene states (``ball.center``), or else of
+    ``mi.traverse`` (``ball.to_world``)."""
+    unset = _set_stated(state, keys)
+    stated = [key for node, place in _named(state) for key in _stated_keys(node, place)] if unset else []
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False
     config.merge_meshes = merge
     mi.parser.transform_all(config, state)
     with two_threads, held():  # an interrupt would leave plugins half made, and later renders would crash
-        return mi.parser.instantiate(config, state)
+        loaded = mi.parser.instantiate(config, state)
+    set_parameters(loaded, unset, stated)
+    return loaded
+
+
+# Types of values that a scene states, as ``mi.traverse`` calls them
+_STATED = {
+    "bool": "bool",
+    "int": "int",
+    "float": "Float",
+    "str": "str",
+    "Array3f64": "Point3f",
+    "ScalarColor3d": "Color3f",
+    "ScalarAffineTransform4d": "AffineTransform4f",
+}
+
+
+def _named(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, str]]:
+    """Yield the objects of a scene that have a name: by their place in a dict, or by their id in XML."""
+    places = state.node_paths
+    for number, node in enumerate(state.nodes):
+        place = places[number] if places else node.props.id()
+        if place:
+            yield node, place
+
+
+def _stated_keys(node: mi.parser.SceneNode, place: str) -> list[str]:
+    kinds = {name: type(node.props[name]).__name__ for name in node.props}
+    return [f"{place}.{name}" for name, kind in kinds.items() if kind in _STATED]
+
+
+def _set_stated(state: mi.parser.ParserState, keys: Values) -> Values:
+    """Change what a scene states before its objects are made; return the values of other keys."""
+    unset = dict(keys)
+    owners = {key.rpartition(".")[0] for key in keys}
+    for node, place in _named(state):
+        if place not in owners:
+            continue
+        for key in keys.keys() & {*_stated_keys(node, place)}:
+            name = key.rpartition(".")[2]
+            kind = type(node.props[name])
+            node.props[name] = _converted(key, unset.pop(key), kind, _STATED[kind.__name__])
+    return unset
+
+
+def set_parameters(loaded: mi.Object, values: Values, stated: Sequence[str] = ()) -> None:
+    """Set values by their ``mi.traverse`` key; raise ``UsageError`` for unknown ones and wrong types.
+
+    ``stated``: further keys that a message may suggest.
+    """
+    if not values:
+        return
+    parameters = mi.traverse(loaded)
+    for key, value in values.items():
+        if key not in parameters:
+            close = difflib.get_close_matches(key, [*parameters.keys(), *stated], n=1)
+            hint = f"did you mean {close[0]}?" if close else "print(mi.traverse(scene)) lists all"
+            raise UsageError(f"the scene has no parameter {key}: {hint}")
+        kind = type(parameters[key])
+        parameters[key] = _converted(key, value, kind, kind.__name__)
+    parameters.update()
+
+
+def _converted(key: str, value: Any, kind: type, name: str) -> Any:
+    """A value as one of a type; ``UsageError`` if it is not."""
+    try:
+        if kind in (str, bool, int) and not isinstance(value, kind):
+            raise TypeError
+        return kind(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise UsageError(f"{key}={value!r}: must be a {name}") from None
 
 
 @contextlib.contextmanager
@@ -168,23 +270,72 @@ def _check_dict(node: Values, inputs: set[str], place: str = "", depth: int = 1)
             _check_data(value, inputs)
 
 
-def _check_xml(path: str, parameters: Mapping[str, str], inputs: set[str]) -> Mapping[str, str]:
-    """Look at an XML file and those that it includes before Mitsuba opens them; return its parameters."""
-    values = dict(parameters)
-    files = [path]
-    inputs.add(path)
-    for including in files:  # which grows
-        for tag, attributes in elements(including):
-            if tag == "default":
-                values.setdefault(attributes.get("name", ""), attributes.get("value", ""))
-                continue
-            filename = attributes.get("value" if tag == "path" else "filename", "")
-            for name in sorted(values, key=len, reverse=True):  # the longest first, as Mitsuba does
-                filename = filename.replace(f"${name}", values[name]) if name else filename
-            if tag == "path":
-                mitsuba_first(_resolved(filename))
-            elif filename:
-                file = _check_data(filename, inputs)
-                if tag == "include" and os.path.isfile(file) and file not in files:
-                    files.append(file)
-    return values
+@dataclass
+class XmlParameters:
+    """The ``$parameters`` of an XML file, read with what it includes before Mitsuba opens any of them.
+
+    Parameters are substituted in the order of Mitsuba's parser, so that the names of included files are known
+    and what they come to is bounded.
+    """
+
+    given: Mapping[str, str]
+    options: Values  #: of a render; one that is given is the value of a parameter of its name
+    inputs: set[str]  #: paths of the files found
+    values: dict[str, str] = field(default_factory=dict)  #: given, of options, and defaults as declared
+    used: set[str] = field(default_factory=set)
+    declared: set[str] = field(default_factory=set)  #: whose value is the default
+    length: int = 0  #: characters substituted so far
+    includes: int = 0
+
+    def __post_init__(self) -> None:
+        self.values |= self.given
+
+    def read(self, path: str, depth: int = 0) -> None:
+        """Read a file and, at their places, those that it includes. Raises ``RuntimeError``."""
+        self.inputs.add(path)
+        for tag, raw in elements(path):
+            attributes = {key: self._substituted(text) if "$" in text else text for key, text in raw.items()}
+            name = attributes.get("name", "")
+            if tag == "default" and name not in self.values:
+                option = self.options.get(name)
+                self.values[name] = attributes.get("value", "") if option is None else str(option)
+                if option is None:
+                    self.declared.add(name)
+            elif tag == "path":
+                mitsuba_first(_resolved(attributes.get("value", "")))
+            elif tag != "default" and attributes.get("filename"):
+                file = _check_data(attributes["filename"], self.inputs)
+                if tag == "include" and os.path.isfile(file) and depth < DEEPEST_INCLUDE:
+                    self._include(file, depth + 1)
+
+    def _include(self, file: str, depth: int) -> None:
+        self.includes += 1
+        if self.includes > MOST_INCLUDES:
+            raise RuntimeError(f"it includes more than {MOST_INCLUDES} files")
+        outside = mi.file_resolver()
+        mitsuba_first(os.path.dirname(file))  # an included file's own includes are relative to it
+        self.read(file, depth)
+        mi.set_file_resolver(outside)
+
+    def _substituted(self, text: str) -> str:
+        """An attribute with its parameters filled in."""
+        for name in re.findall(r"\$(\w+)", text):
+            if name not in self.values and self.options.get(name) is not None:
+                self.values[name] = str(self.options[name])
+        for name in sorted(filter(None, self.values), key=len, reverse=True):  # the longest first, as Mitsuba
+            pieces = re.split(rf"(?<!\\)\${re.escape(name)}", text)
+            if pieces[1:]:
+                self.used.add(name)
+                self.length += len(pieces) * len(self.values[name])
+                if self.length > LONGEST_SUBSTITUTION:
+                    raise RuntimeError(f"its parameters come to more than {LONGEST_SUBSTITUTION} characters")
+                text = self.values[name].join(pieces)
+        return text
+
+    def check(self, path: str) -> None:
+        """Raise ``UsageError`` for a parameter that was given and is used in no file."""
+        for name in self.given.keys() - self.used - {"focaldist", "focalrange"}:
+            known = {*self.used, *self.declared}
+            close = difflib.get_close_matches(name, [*known, *self.options], n=1)
+            hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(sorted(known)) or 'none'}"
+            raise UsageError(f"{path} has no parameter ${name}: {hint}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import operator
 import os
 from collections.abc import Iterator, Mapping
@@ -12,13 +11,13 @@ from typing import Any, SupportsIndex
 
 import mitsuba as mi
 
-from mrt_mitsuba.adaptive.target import Goal, StatesGoal
-from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.adaptive.target import Goal, StatesGoal, Target
+from mrt_mitsuba.errors import SceneError, UsageError, warn
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import Values, is_obj, is_path
 from mrt_mitsuba.plugins.variants import text_of
 from mrt_mitsuba.scene.loading import load_dict, load_file
-from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE, Scene
+from mrt_mitsuba.scene.model import FOCAL_RANGE, MODEL_OPTIONS, SIZE, Scene
 from mrt_mitsuba.scene.report import report_scene
 
 WIDEST_FILTER = 1024  # pixels: the largest radius of a film's filter
@@ -44,40 +43,41 @@ class Source:
 def open_scene(
     scene: object,
     *,
-    size: tuple[int | None, int | None] = (None, None),
+    width: int | None = None,
+    height: int | None = None,
     fresnel: str | None = None,
     integrator: object = None,
-    budget: Budget | None = None,
     sensor: int = 0,
     params: Values | None = None,
-    model: Values | None = None,
+    budget: Budget | None = None,
+    **options: Any,
 ) -> Source:
-    """Load a scene; see ``render`` for what it may be. Raises ``SceneError`` or ``UsageError``.
+    """Load a scene by the options of ``render``; see there for what it may be.
 
-    ``size``: width and height; ``budget``: memory from which its textures take theirs; ``model``: options of
-    ``obj_scene``.
+    ``budget``: memory from which its textures take theirs. Of other options, those of ``obj_scene`` are for
+    OBJ files, and any is the value of a parameter of an XML file that has the same name.
+    Raises ``SceneError`` or ``UsageError``.
     """
-    terms = in_terms(scene, model or {})
-    # a key of mi.traverse has a dot, the name of a parameter of an XML file has none
     params = params or {}
-    keys = {key: value for key, value in params.items() if "." in key}
-    declared = {key: value for key, value in params.items() if "." not in key}
-    if declared and not is_path(scene, ".xml"):
+    model = {name: options[name] for name in MODEL_OPTIONS if options.get(name) is not None}
+    if isinstance(model.get("target"), Target):
+        del model["target"]  # of the error
+    terms = in_terms(scene, model)
+    names = [key for key in params if "." not in key]
+    if names and not is_path(scene, ".xml"):
         raise UsageError(
-            f"params: {next(iter(declared))} is not a key of mi.traverse, and only an XML file declares names"
+            f"params: {names[0]} is not a key of mi.traverse, and only an XML file declares names"
         )
     if terms is not None:
         if budget is not None:
             budget.inputs.update(terms.files)
-        width = size[0] or SIZE[0]
-        height = size[1] or SIZE[1]
         fresnel = fresnel or "schlick"
         name = terms.title or "a scene"
         if isinstance(scene, SupportsIndex):
             name = str(operator.index(scene))
-        nodes = terms.to_dict(width=width, height=height, fresnel=fresnel)
+        nodes = terms.to_dict(width=width or SIZE[0], height=height or SIZE[1], fresnel=fresnel)
         # its meshes have a material each: kept apart, they stay in order, and a file has the same layers
-        loaded = load_dict(nodes, name, budget, merge=False)
+        loaded = load_dict(nodes, name, budget, merge=False, keys=params)
         distance = terms.focal_distance
         reach = terms.focal_range
     else:
@@ -85,17 +85,20 @@ def open_scene(
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
             )
-        name, loaded, values = _loaded(scene, budget, declared)
-        if keys and loaded is scene:
-            raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
+        given = {"width": width, "height": height, "integrator": integrator, "sensor": sensor or None}
+        plain = {
+            key: value if isinstance(value, str | int | float) else None
+            for key, value in (options | given).items()
+        }
+        name, loaded, values = _loaded(scene, budget, params, plain)
         distance = _number(values, "focaldist", None)
         reach = _number(values, "focalrange", FOCAL_RANGE)
-    set_parameters(loaded, keys)
-    source = opened(name, loaded, _sensor(name, loaded, sensor), _integrator(integrator, loaded))
+    view = _sensor(name, loaded, sensor)
+    source = opened(name, loaded, view, _integrator(name, integrator, loaded))
     return replace(
         source,
-        width=size[0] or source.width,
-        height=size[1] or source.height,
+        width=width or source.width,
+        height=height or source.height,
         focal_distance=distance,
         focal_range=reach,
         fresnel=fresnel,
@@ -117,24 +120,6 @@ def in_terms(scene: Any, model: Values) -> Scene | None:
     return scene if isinstance(scene, Scene) else None
 
 
-def set_parameters(scene: mi.Scene, values: Values) -> None:
-    """Set values by their ``mi.traverse`` key; raise ``UsageError`` for unknown ones and wrong types."""
-    if not values:
-        return
-    parameters = mi.traverse(scene)
-    for key, value in values.items():
-        if key not in parameters:
-            close = difflib.get_close_matches(key, parameters.keys(), n=1)
-            hint = f"did you mean {close[0]}?" if close else "print(mi.traverse(scene)) lists all"
-            raise UsageError(f"the scene has no parameter {key}: {hint}")
-        kind = type(parameters[key])
-        try:
-            parameters[key] = kind(value)
-        except (TypeError, ValueError, RuntimeError):
-            raise UsageError(f"{key}={value!r}: must be a {kind.__name__}") from None
-    parameters.update()
-
-
 @contextmanager
 def sized(source: Source) -> Iterator[None]:
     """Give the film the source's size within the block; a film of another size loses its crop window."""
@@ -153,15 +138,17 @@ def sized(source: Source) -> Iterator[None]:
 
 
 def _loaded(
-    scene: object, budget: Budget | None, declared: Values
+    scene: object, budget: Budget | None, params: Values, options: Values
 ) -> tuple[str, mi.Scene, Mapping[str, str]]:
     """The name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
     if isinstance(scene, dict):
-        return "a dict", load_dict(scene, budget=budget), {}
+        return "a dict", load_dict(scene, budget=budget, keys=params), {}
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return os.path.basename(path), *load_file(path, declared, budget)
+        return os.path.basename(path), *load_file(path, params, budget, options=options)
     if isinstance(scene, mi.Scene):
+        if params:
+            raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")
         return "a Mitsuba scene", scene, {}
     _check_variant("scene", scene)
     raise UsageError(f"scene is {text_of(scene)}: give a number, a Scene, a dict, a Mitsuba scene or a path")
@@ -218,9 +205,14 @@ def opened(name: str, scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integra
     return Source(name, scene, sensor, integrator, int(width), int(height), own=True, goal=goal)
 
 
-def _integrator(integrator: Any, scene: mi.Scene) -> mi.Integrator:
+def _integrator(name: str, integrator: Any, scene: mi.Scene) -> mi.Integrator:
+    """Return the integrator asked for, or the scene's; without either, a path tracer, with a warning."""
     if integrator is None:
-        integrator = scene.integrator() or "mrt_whitted"
+        integrator = scene.integrator()
+    if integrator is None:
+        media = any(shape.is_medium_transition() for shape in scene.shapes())
+        integrator = "volpath" if media else "path"
+        warn(f"{name} has no integrator: it is rendered with integrator={integrator}; write this, or another")
     if isinstance(integrator, str):
         integrator = {"type": integrator}
     if isinstance(integrator, dict):

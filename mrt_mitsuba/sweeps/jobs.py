@@ -18,12 +18,13 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import Values
+from mrt_mitsuba.rendering.api import open_with
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.runtime import use, versions
 from mrt_mitsuba.scene.files import require_file
 from mrt_mitsuba.scene.model import Scene
-from mrt_mitsuba.scene.open import open_scene, set_parameters
 from mrt_mitsuba.scene.report import report_scene
 
 MOST_JOBS = 100_000  # all are held in memory
@@ -162,15 +163,16 @@ def jobs(scene: Any, named: Mapping[str, Values], fixed: Values, folder: str) ->
 
 
 def check_parameters(jobs: Sequence[Job]) -> None:
-    """Raise ``UsageError`` if a job sets what its scene does not have; each scene is loaded once."""
-    loaded: dict[str, Any] = {}
+    """Raise ``UsageError`` if a job sets what its scene does not have; each scene is loaded once for values
+    of the same types."""
+    opened = set()
     for job in jobs:
         params = job.arguments.get("params") or {}
-        declared = {name: value for name, value in params.items() if "." not in name}
-        which = fingerprint(job.scene, declared)
-        if params and which not in loaded:
-            loaded[which] = open_scene(receive(job.scene), params=declared).scene
-        set_parameters(loaded.get(which), {key: params[key] for key in params.keys() - declared.keys()})
+        names = {name: value if "." not in name else type(value).__name__ for name, value in params.items()}
+        which = fingerprint(job.scene, names)
+        if params and which not in opened:
+            opened.add(which)
+            open_with(receive(job.scene), RenderSettings.of(**job.arguments), Budget.of(None))
 
 
 # ------------------------------------- Scenes on their way to workers ------------------------------------

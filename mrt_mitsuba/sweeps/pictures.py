@@ -91,7 +91,7 @@ def cut(job: Job, tiles: Any) -> list[Job]:
         raise UsageError("tiles: target and aamode=noise share the rays out over the whole picture")
     size: Any = job.arguments.get("width"), job.arguments.get("height")
     if None in size:  # only the scene knows
-        source = open_scene(receive(job.scene), size=size)
+        source = open_scene(receive(job.scene), width=size[0], height=size[1])
         size = source.width, source.height
     width, height = size
     rows, columns = tiles

@@ -111,8 +111,9 @@ def test_an_xml_file_is_exported_as_it_renders(tmp_path):
     Image.new("RGB", (4, 4), (200, 100, 50)).save(tmp_path / "in" / "t.png")
     (tmp_path / "in" / "sky.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
     (tmp_path / "in" / "a.xml").write_text(
-        """<scene version="3.0.0"><default name="r" value="1"/><default name="focaldist" value="4"/>
-        <include filename="sky.xml"/><sensor type="perspective"><film type="hdrfilm">
+        """<scene version="3.0.0"><integrator type="path"/><default name="r" value="1"/>
+        <default name="focaldist" value="4"/><include filename="sky.xml"/>
+        <sensor type="perspective"><film type="hdrfilm">
         <integer name="width" value="16"/><integer name="height" value="12"/></film></sensor>
         <shape type="sphere"><float name="radius" value="$r"/><point name="center" value="0 0 5"/>
         <bsdf type="mrt_bsdf"><texture name="diffuse_reflectance" type="mrt_texture">

@@ -5,11 +5,16 @@ from __future__ import annotations
 import hashlib
 import re
 
+import mitsuba as mi
 import numpy as np
 import pytest
+from cases import Cases
+from nodes import sensor
 from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.errors import MrtError, MrtWarning, SceneError
+from mrt_mitsuba.scene.export import write_xml
 from mrt_mitsuba.scene.model import Camera, Material, Scene, Sphere
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
@@ -82,3 +87,98 @@ def test_a_scene_of_any_size_is_seen_whole(scale, integrator):
     image = mrt.render(scene, width=16, height=12, aa=1, aamode="none", integrator=integrator).image
     assert_array_equal(image[5:7, 7:9], 0)
     assert_allclose(image[[0, -1]], np.broadcast_to([0.25, 0.5, 1], (2, 16, 3)), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("more", "kind"), [({}, "path"), ({"interior": {"type": "homogeneous"}}, "volpath")])
+def test_a_scene_without_integrator_is_rendered_by_a_path_tracer(more, kind):
+    """The light of a mirror image, which ``mrt_whitted`` does not see; the report's scenes keep theirs."""
+    nodes = {"type": "scene", "sensor": sensor([0, 0, 5], [0, 0, 0], (8, 6)), "sky": {"type": "constant"}}
+    nodes["ball"] = {"type": "sphere", "bsdf": {"type": "dielectric"}, **more}
+    options = {"spp": 4, "width": 8, "height": 6}
+    expected = mrt.render(nodes, integrator=kind, **options).image
+    for scene in (nodes, mi.load_dict(nodes)):
+        with pytest.warns(MrtWarning, match=f"no integrator: it is rendered with integrator={kind};"):
+            assert_array_equal(mrt.render(scene, **options).image, expected)
+
+
+OUTER = """<scene version="3.0.0"><integrator type="$integrator"/><include filename="$where/inner.xml"/>
+<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>
+<integer name="height" value="3"/></film><sampler type="independent">
+<integer name="sample_count" value="$spp"/></sampler></sensor></scene>"""
+INNER = """<scene version="3.0.0"><default name="glow" value="2"/><include filename="sky.xml"/></scene>"""
+SKY = """<scene version="3.0.0"><shape type="sphere" id="ball"><float name="radius" value="1"/>
+<point name="center" x="0" y="0" z="99"/></shape><emitter type="constant" id="sky">
+<rgb name="radiance" value="$glow"/></emitter></scene>"""
+
+
+@pytest.fixture
+def nested(tmp_path):
+    """An XML file that includes one in a folder, which includes one next to itself."""
+    (tmp_path / "in").mkdir()
+    for name, text in (("outer", OUTER), ("in/inner", INNER), ("in/sky", SKY)):
+        (tmp_path / f"{name}.xml").write_text(text)
+    return tmp_path / "outer.xml"
+
+
+ALL = {"integrator": "path", "where": "in", "spp": 4}
+found = Cases()
+found({"params": ALL}, 2, 4)  # the default of an included file
+found({"params": ALL | {"glow": 3}}, 3, 4)
+found({"params": {"where": "in"}, "integrator": "direct", "spp": 9}, 2, 9)  # options fill in parameters
+found({"params": ALL, "spp": 9}, 2, 9)
+found({"params": ALL | {"sky.radiance": [5, 5, 5]}}, 5, 4)  # what a file states
+found({"params": ALL | {"ball.center": [0, 0, 5], "ball.radius": 9}}, 0, 4)
+
+
+@pytest.mark.parametrize(("options", "value", "rays"), found)
+def test_parameters_of_a_file_and_those_that_it_includes(nested, options, value, rays):
+    result = mrt.render(nested, **options)
+    assert_allclose(np.median(result.image), value, rtol=1e-6)
+    assert result.plan.passes[0].places.size == rays
+    (where,) = write_xml(nested, nested.parent / "flat.xml", params=ALL)
+    assert mrt.render(where).plan.passes[0].places.size == 4
+
+
+wrong = Cases()
+wrong(ALL | {"glo": 3}, r"has no parameter \$glo: did you mean glow\?")
+wrong(ALL | {"wdith": 3}, r"has no parameter \$wdith: did you mean width\?")
+wrong(ALL | {"zzz": 3}, r"has no parameter \$zzz: it has glow, integrator, spp, where")
+wrong({"where": "in"}, r"undefined parameter: \$integrator")
+wrong(ALL | {"ball.centre": [0, 0, 5]}, r"no parameter ball.centre: did you mean ball.center\?")
+wrong(ALL | {"ball.center": [0, 5]}, "must be a Point3f")
+wrong(ALL | {"glow": "1" * 2**24}, "its parameters come to more than 16777216 characters")
+
+
+@pytest.mark.parametrize(("params", "message"), wrong)
+def test_parameters_that_are_refused(nested, params, message):
+    with pytest.raises(MrtError, match=message):
+        mrt.render(nested, params=params)
+
+
+DOUBLE = "".join(f'<default name="a{i:02}" value="{f"$a{i - 1:02}" * 9 if i else "x"}"/>' for i in range(12))
+
+
+@pytest.mark.parametrize("text", [DOUBLE, '<include filename="in/inner.xml"/>' * 501])
+def test_files_that_multiply_are_refused(nested, text):
+    """Gigabytes from some hundred bytes: of parameters that name each other, of files included many times."""
+    nested.write_text(f'<scene version="3.0.0">{text}</scene>')
+    with pytest.raises(SceneError, match=r"come to more than|includes more than 1000 files"):
+        mrt.render(nested)
+
+
+def test_a_numbered_scene_can_be_changed_by_keys_of_its_dict():
+    nodes = mrt.scene_dict(3, width=96, height=72)
+    nodes["sphere_0"] |= {"center": [0, 0.5, 0.2], "radius": 0.4}
+    nodes["material_0"]["diffuse_reflectance"]["value"] = [0.9, 0.1, 0]
+    nodes["light_0"]["position"] = [1, 2, 1]
+    nodes["sensor"]["to_world"] = nodes["sensor"]["to_world"] @ mi.ScalarTransform4f().rotate([0, 0, 1], 9)
+    keys = ["sphere_0.center", "sphere_0.radius", "light_0.position", "sensor.to_world"]
+    params = {key: nodes[key.split(".")[0]][key.split(".")[1]] for key in keys}
+    params |= {"sensor.to_world": np.array(params["sensor.to_world"].matrix)}
+    params |= {"material_0.diffuse_reflectance": [0.9, 0.1, 0]}
+    images = [
+        mrt.render(scene, focaldist=0, lattice="report", **SIZE, **more).image
+        for scene, more in ((nodes, {}), (3, {"params": params}), (3, {}))
+    ]
+    assert_array_equal(images[0], images[1])
+    assert abs(images[0] - images[2]).max() > 0.1
