@@ -79,7 +79,7 @@ def needs_extra(extra: str = "validation") -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         name = str(error.name).partition(".")[0]
-        raise MrtError(NOT_INSTALLED.format(name, extra)) from error
+        raise MrtError(NOT_INSTALLED.format(name, extra)) from None
 
 
 def warn(text: str) -> None:

@@ -403,6 +403,16 @@ def test_objects_of_another_variant_are_named():
             mrt.render(**TINY | given)
 
 
+def test_a_callback_that_changes_the_variant():
+    def change(picture: Any) -> None:
+        mi.set_variant("scalar_rgb")
+
+    text = "on_round changed Mitsuba's variant from llvm_ad_rgb to scalar_rgb"
+    with pytest.raises(mrt.UsageError, match=text):
+        mrt.render(3, **TINY | {"aamode": "noise", "spp": 16, "aa": None}, on_round=change)
+    mi.set_variant("llvm_ad_rgb")
+
+
 CORNERS = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32)
 FACES = np.array([[[0, 1, 2]]], np.uint32)
 FOREIGN_FACES = np.array([[[0, 1, 3]]], np.uint32)

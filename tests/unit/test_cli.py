@@ -131,6 +131,7 @@ def test_what_is_not_installed_is_named_with_the_way_to_install_it(run_python):
     assert run_python(begin + command, code=1).stderr == f"mrt: {text}\n"
     found = run_python(begin + "import mrt_mitsuba as mrt; mrt.check_bsdf", code=1).stderr
     assert found.endswith(f"mrt_mitsuba.errors.MrtError: {text}\n")
+    assert found.count("Traceback") == 1
 
 
 @pytest.mark.parametrize("word", ["target=0.01", "target=2%", "aa=2", "maxspp=64"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import mitsuba as mi
@@ -13,6 +14,8 @@ from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.files.images import read_exr
+from mrt_mitsuba.rendering.api import as_json
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -43,6 +46,36 @@ def test_params_reach_what_is_made_of_them():
     depth = mrt.render(nodes, params={"ball.to_world": mi.Transform4f(aside)}, **options).layers["depth.Z"]
     assert_array_equal(depth, mrt.render(moved, **options).layers["depth.Z"])
     assert np.isfinite(depth).any()
+
+
+IDENTITY = [[float(row == column) for column in range(4)] for row in range(4)]
+saved = Cases()
+saved("material_0.alpha", lambda: 0.5, 0.5)
+saved("material_0.alpha", lambda: np.float32(0.5), 0.5)
+saved("material_0.alpha", lambda: mi.Float(0.5), 0.5)
+saved("light_1.intensity.value", lambda: np.array([0.5, 0.25, 1.0]), [0.5, 0.25, 1])
+saved("light_1.intensity.value", lambda: mi.Color3f(0.5, 0.25, 1), [0.5, 0.25, 1])
+saved("sphere_0.to_world", lambda: mi.ScalarTransform4f(), IDENTITY)
+saved("sphere_0.to_world", lambda: mi.Transform4f(), IDENTITY)
+
+
+@pytest.mark.parametrize(("key", "value", "written"), saved)
+def test_the_header_holds_values_of_any_type(tmp_path, key, value, written):
+    mrt.render(3, params={key: value()}, **SIZE).save(tmp_path / "a.exr")
+    assert json.loads(read_exr(tmp_path / "a.exr").header["mrt:options"])["params"] == {key: written}
+
+
+def test_a_result_is_shown_in_a_line_and_as_a_picture():
+    result = mrt.render(3, aamode="noise", spp=16, width=32, height=24)
+    assert str(result).startswith("<Result of scene 3: 32x24, layers depth.Z")
+    assert f"error {result.error}" in str(result)
+    assert result._repr_html_().count("<img") == 1
+
+
+def test_what_is_large_or_no_array_is_named_by_its_type():
+    assert as_json({"a": (np.zeros((99, 99)), mi, None, {"b": True})}) == {
+        "a": ["<ndarray>", "<module>", None, {"b": True}]
+    }
 
 
 refused = Cases()
