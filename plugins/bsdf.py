@@ -13,30 +13,30 @@ import mitsuba as mi
 import numpy as np
 
 from .fresnel import f0_from_ior
-from .lobes import LOBES, NUMBERS, Lobes, Pair
+from .lobes import CHOICES, LOBES, NUMBERS, Lobes, Pair
 from .parameters import ParameterError, choice, flag, number, spectrum
 from .variants import first, largest, plain, updatable, varies
 from .whitted.plan import GRADIENTS, VARYING, Mirror
 
-FRESNEL_FORMS = ("schlick", "dielectric", "unity")
-
 
 class MrtBSDF(mi.BSDF):
-    r"""Lambertian base under a Beckmann microfacet lobe, as in the original ray tracer.
+    r"""Lambertian base under a microfacet lobe, as in the original ray tracer.
 
     .. math::
         f = \frac{k_d}{\pi} + k_s \frac{F(\omega_i \cdot h)\, D(h)\, G_1(\omega_i) G_1(\omega_o)}
                                        {4 \cos\theta_i \cos\theta_o}
 
-    with Beckmann's D, the rational fit of Smith's G₁ (Walter et al. 2007) and one of three Fresnel terms. The
-    two lobes are simply added, so energy is conserved only where k_d and k_s promise it.
+    with one of two distributions D, each with Smith's G₁ (Walter et al. 2007; that of Beckmann by a rational
+    fit), and one of three Fresnel terms. The two lobes are simply added, so energy is conserved only where
+    k_d and k_s promise it.
 
     ======================== ================ ========= ====================================================
     name                     type             default   unit or range
     ======================== ================ ========= ====================================================
-    ``alpha``                float or texture 0.1       roughness; 0 acts as 1e-8, a negative value keeps
-                                                        its sign in G₁ (scene 2 of the report holds some),
-                                                        and where f would be negative it is 0
+    ``distribution``         string           beckmann  ``beckmann``, or ``ggx``, with longer tails
+    ``alpha``                float or texture 0.1       roughness; 0 acts as 1e-8. A negative value keeps its
+                                                        sign in Beckmann's G₁ (scene 2 of the report holds
+                                                        some), and where f would be negative it is 0
     ``int_ior``              float or texture 1.5       > 0, index of refraction inside
     ``ext_ior``              float or texture 1.0       > 0, index of refraction outside
     ``diffuse_reflectance``  spectrum/texture 0.5       k_d, may exceed 1
@@ -63,16 +63,16 @@ class MrtBSDF(mi.BSDF):
 
     Nearest stock plugins: ``roughconductor`` (same D and G, exact conductor Fresnel, no diffuse part) and
     ``roughplastic`` (same lobes, but the diffuse part is refracted through the interface). Reflection is on
-    the side of the normal only. Attributes (``has_attribute``, ``eval_attribute``) are all parameters and
-    ``mirror_reflectance``, k_s F(θi), the weight that ``mrt_whitted`` gives to the mirror ray; ``int_ior``
-    drives its bounce budget.
+    the side of the normal only. Attributes (``has_attribute``, ``eval_attribute``) are all parameters that
+    are numbers, spectra or textures, and ``mirror_reflectance``, k_s F(θi), the weight that ``mrt_whitted``
+    gives to the mirror ray; ``int_ior`` drives its bounce budget.
     In polarised variants the reflected light is depolarised. Samples and their density are constants in
     derivatives: ``sample`` returns the value, which follows the parameters, over the density, which does not.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         mi.BSDF.__init__(self, props)
-        self.fresnel = choice(props, "fresnel", FRESNEL_FORMS)
+        self.choices = {name: choice(props, name, allowed) for name, allowed in CHOICES.items()}
         self.sample_visible = flag(props, "sample_visible", True)
         self.parameters: dict[str, Any] = {}
         for name, (default, limits) in NUMBERS.items():
@@ -83,9 +83,10 @@ class MrtBSDF(mi.BSDF):
         for lobe in LOBES:
             self.parameters[lobe.reflectance] = spectrum(props, lobe.reflectance, lobe.default)
         if "f0" in props:
-            if self.fresnel != "schlick":
+            fresnel = self.choices["fresnel"]
+            if fresnel != "schlick":
                 raise ParameterError(
-                    f'mrt_bsdf: "f0" has no meaning with fresnel="{self.fresnel}"; leave one of them out'
+                    f'mrt_bsdf: "f0" has no meaning with fresnel="{fresnel}"; leave one of them out'
                 )
             self.parameters["f0"] = spectrum(props, "f0")
         self._update()
@@ -119,7 +120,7 @@ class MrtBSDF(mi.BSDF):
     def lobes(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Lobes:
         """Return the lobes at a surface point."""
         given = {name: self._read(name, si, active) for name in self.parameters}
-        return Lobes(self.fresnel, given, si.wi, visible=self.sample_visible)
+        return Lobes(self.choices, given, si.wi, visible=self.sample_visible)
 
     def fixed_row(self) -> np.ndarray | str:
         """Return the parameters as plain numbers [2 + lobes, 4], or why they are none: numbers, a reflectance
@@ -218,12 +219,14 @@ class MrtBSDF(mi.BSDF):
         f0 = 1.0
         if "f0" in self.parameters:
             f0 = largest(self.parameters["f0"])
-        elif self.fresnel != "unity" and not any(isinstance(index, mi.Texture) for index in indices):
+        elif self.choices["fresnel"] != "unity" and not any(
+            isinstance(index, mi.Texture) for index in indices
+        ):
             f0 = f0_from_ior(*map(first, indices))
         index = math.inf if isinstance(int_ior, mi.Texture) else first(int_ior)
         return Mirror(bound * max(1, f0), index, bound * f0)
 
     def to_string(self) -> str:
-        parameters = self.parameters | {"f0": self.parameters.get("f0")}
+        parameters = self.choices | self.parameters | {"f0": self.parameters.get("f0")}
         text = ", ".join(f"{name}={parameter}" for name, parameter in parameters.items())
-        return f"MrtBSDF[fresnel={self.fresnel}, {text}]"
+        return f"MrtBSDF[{text}]"

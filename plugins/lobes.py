@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,15 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .fresnel import f0_from_ior, fresnel_dielectric, fresnel_schlick
-from .microfacet import (
-    beckmann_d,
-    half_vector_angles,
-    microfacet_specular,
-    sample_beckmann,
-    sample_beckmann_visible,
-    tan2_theta,
-    visible_over_cos,
-)
+from .microfacet import GGX, Beckmann, half_vector_angles, microfacet_specular, tan2_theta
 
 # Roughness below this (zero included) acts as this: the lobe is then narrower than float32 directions can
 # resolve, and D, its inverse square, still fits. Above the other, D is the same everywhere but at the horizon
@@ -91,7 +84,7 @@ class Diffuse:
 
 
 class Specular:
-    """Beckmann's microfacets, each a mirror of Fresnel's reflectance."""
+    """Microfacets, each a mirror of Fresnel's reflectance."""
 
     name = "specular"
     reflectance = "specular_reflectance"
@@ -101,14 +94,14 @@ class Specular:
 
     def value(self, at: Lobes, pair: Pair) -> mi.UnpolarizedSpectrum:
         fresnel = at.fresnel(*half_vector_angles(pair.wi, pair.wo))
-        lobe = microfacet_specular(pair.wi, pair.wo, pair.tan2_theta_h, at.alpha)
+        lobe = microfacet_specular(at.distribution, pair.wi, pair.wo, pair.tan2_theta_h, at.alpha)
         return at.given[self.reflectance] * fresnel * lobe
 
     def density(self, at: Lobes, pair: Pair) -> mi.Float:
         """Return the density of the microfacet normal over 4 ωo·h."""
-        d = beckmann_d(pair.tan2_theta_h, at.alpha)
+        d = at.distribution.d(pair.tan2_theta_h, at.alpha)
         if at.visible:
-            return 0.25 * d * visible_over_cos(pair.wi, at.alpha)
+            return 0.25 * d * at.distribution.visible_over_cos(pair.wi, at.alpha)
         # D cos θh / (4 ωo·h), where h = ωi + ωo is not normalised: cos θh = h.z / |h|, ωo·h = |h|² / 2, and
         # |h|² = h.z² (1 + tan²θh). The product ωo·h itself would feel the rounding of ωo's length: by 2 % at
         # cos θ = 1e-3 in float32
@@ -116,10 +109,9 @@ class Specular:
 
     def sample(self, at: Lobes, wi: mi.Vector3f, sample2: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
         if at.visible:
-            unit = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, 1.0)
-            m = sample_beckmann_visible(wi, at.alpha, sample2, unit.sample_visible_11, mi.Vector3f)
+            m = at.distribution.sample_visible(wi, at.alpha, sample2, mi.Vector3f)
         else:
-            m = sample_beckmann(at.alpha, sample2.x, sample2.y, mi.Vector3f)
+            m = at.distribution.sample(at.alpha, sample2, mi.Vector3f)
         # The drawn normal *is* the half vector: in a narrow lobe, wi + wo has lost the digits in which it
         # differs from n
         return mi.reflect(wi, m), tan2_theta(m)
@@ -131,6 +123,20 @@ class Specular:
 Lobe = Diffuse | Specular
 # In the order of the components of the BSDF
 LOBES: tuple[Lobe, ...] = (Diffuse(), Specular())
+
+
+def _visible_slopes(cos_theta: mi.Float, u: mi.Point2f) -> mi.Vector2f:
+    """Return slopes of Beckmann's microfacets of unit roughness that are visible, as Mitsuba draws them."""
+    return mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, 1.0).sample_visible_11(cos_theta, u)
+
+
+DISTRIBUTIONS: dict[str, Any] = {"beckmann": Beckmann(_visible_slopes), "ggx": GGX()}
+
+# Parameters that are one of a few words; the first is the default
+CHOICES: dict[str, tuple[str, ...]] = {
+    "distribution": tuple(DISTRIBUTIONS),
+    "fresnel": ("schlick", "dielectric", "unity"),
+}
 
 # Parameters that are numbers, or textures of one channel, with their defaults and limits, as ``number`` takes
 # them: up to four of them, which is what a row of the table of materials holds
@@ -145,11 +151,12 @@ NUMBERS: dict[str, tuple[float, dict[str, float]]] = {
 class Lobes:
     """Value, density and samples of the lobes, seen from the local direction ``wi``.
 
-    ``given``: the parameters of the BSDF there, by name. Samples and their density are constants in
-    derivatives (detached sampling): only the value, divided by the density, follows the parameters.
+    ``choices`` and ``given``: the parameters of the BSDF there, by name. Samples and their density are
+    constants in derivatives (detached sampling): only the value, divided by the density, follows the
+    parameters.
     """
 
-    form: str  # of Fresnel's reflectance
+    choices: Mapping[str, str]
     given: dict[str, Any]
     wi: mi.Vector3f
     visible: bool = True  # are visible normals sampled
@@ -157,7 +164,12 @@ class Lobes:
     @cached_property
     def constant(self) -> Lobes:
         """The same without derivatives by the parameters."""
-        return Lobes(self.form, dr.detach(self.given), self.wi, visible=self.visible)
+        return Lobes(self.choices, dr.detach(self.given), self.wi, visible=self.visible)
+
+    @property
+    def distribution(self) -> Any:
+        """The distribution of the microfacets."""
+        return DISTRIBUTIONS[self.choices["distribution"]]
 
     @cached_property
     def alpha(self) -> mi.Float:
@@ -168,11 +180,12 @@ class Lobes:
 
     def fresnel(self, cos_theta: mi.Float, sin2_theta: mi.Float) -> mi.UnpolarizedSpectrum:
         """Return F at a microfacet: a float, or a spectrum where ``f0`` was given."""
-        if self.form == "unity":
+        form = self.choices["fresnel"]
+        if form == "unity":
             return mi.Float(1)
         ext_ior = _within(self.given["ext_ior"], IOR_MIN, IOR_MAX)
         int_ior = _within(self.given["int_ior"], IOR_MIN, IOR_MAX)
-        if self.form == "dielectric":
+        if form == "dielectric":
             return fresnel_dielectric(cos_theta, ext_ior, int_ior, sin2_theta)
         f0 = self.given.get("f0")
         if f0 is None:

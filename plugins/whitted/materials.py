@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import is_known, plugin
-from ..lobes import LOBES, NUMBERS, Lobes
+from ..lobes import CHOICES, LOBES, NUMBERS, Lobes
 from ..table import names_in
 from ..variants import is_jit, varies
 from .plan import SCALAR_VARIANT
@@ -32,8 +32,10 @@ def material_rows(shapes: Sequence[mi.Shape]) -> tuple[list[np.ndarray], str]:
         # Inside an instance, shapes are not the scene's own
         "instances in the scene": any(s.class_name() == "Instance" for s in shapes),
         f"a material other than {names_in('materials')}": not mergeable,
-        "materials of different Fresnel formulas": mergeable and len({b.fresnel for b in bsdfs.values()}) > 1,
     }
+    for name in CHOICES:
+        different = mergeable and len({b.choices[name] for b in bsdfs.values()}) > 1
+        obstacles[f'materials of different "{name}"'] = different
     reasons = [why for why, holds in obstacles.items() if holds]
     rows = {} if reasons else {key: bsdf.fixed_row() for key, bsdf in bsdfs.items()}
     reasons += [row for row in rows.values() if isinstance(row, str)]
@@ -46,7 +48,7 @@ class MaterialTable:
     """The parameters of the materials, as rows of ``material_rows``: looked up, they make ``Lobes``."""
 
     def __init__(self, shapes: Sequence[mi.Shape], rows: Sequence[np.ndarray]) -> None:
-        self.fresnel = shapes[0].bsdf().fresnel
+        self.choices = shapes[0].bsdf().choices
         #: the names of the colours of a row; ``f0`` is read only where a material has one of its own
         self.colors = [lobe.reflectance for lobe in LOBES]
         if any("f0" in shape.bsdf().parameters for shape in shapes):
@@ -62,7 +64,7 @@ class MaterialTable:
         for part, name in enumerate(self.colors, start=1):
             color = self.by_shape(si, mi.Bool(True), part)
             given[name] = mi.UnpolarizedSpectrum(list(color)[:channels])
-        return Lobes(self.fresnel, given, si.wi)
+        return Lobes(self.choices, given, si.wi)
 
 
 def is_mrt_bsdf(bsdf: mi.BSDF) -> bool:

@@ -303,8 +303,9 @@ def test_runs_are_timed_in_turns():
 SMALL: dict[str, Any] = {"size": 32, "spp": 8, "renders": 32, "pairs": 2000}
 
 
-def test_comparison_finds_them_equal(tmp_path):
-    found = mrt.compare_roughconductor(alpha=0.2, **SMALL)
+@pytest.mark.parametrize("distribution", ["beckmann", "ggx"])
+def test_comparison_finds_them_equal(tmp_path, distribution):
+    found = mrt.compare_roughconductor(alpha=0.2, distribution=distribution, **SMALL)
     assert found.equal
     assert 0 < found.errors["value"] < 2e-5
     assert found.errors["pixels that differ, with the same random numbers"] < 5e-3

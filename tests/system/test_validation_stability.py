@@ -33,7 +33,7 @@ def test_every_case_holds_and_is_a_row_with_a_mark():
     assert all(len(row[2]) > 30 for row in rows if row[-1] == "cannot hold")
 
 
-beckmann_d = microfacet.beckmann_d
+beckmann_d = microfacet.Beckmann.d
 blur = filters.gaussian_dof
 density = lobes.Lobes.density
 schlick = fresnel.fresnel_schlick
@@ -54,8 +54,8 @@ def steep(cos_theta: Any, *iors: Any) -> Any:
     return dielectric(dr.sqrt(1 - dr.square(dr.sqrt(1 - dr.square(cos_theta)))), *iors)
 
 
-def steep_gradient(tan2_theta: Any, alpha: Any) -> Any:
-    return beckmann_d(tan2_theta, dr.detach(alpha) + 1.0001 * (alpha - dr.detach(alpha)))
+def steep_gradient(self: Any, tan2_theta: Any, alpha: Any) -> Any:
+    return beckmann_d(self, tan2_theta, dr.detach(alpha) + 1.0001 * (alpha - dr.detach(alpha)))
 
 
 def spreading(image: Any, depth: Any, **options: Any) -> Any:
@@ -85,9 +85,8 @@ loss("tan θ in the plugin", "bsdf", (lobes, "tan2_theta", report_tan2_theta), m
 at_grazing = ["F, largest", "F at the critical angle"]
 loss("Fresnel", "bsdf", (fresnel, "fresnel_dielectric", steep), missed=at_grazing)
 loss("Schlick", "bsdf", (fresnel, "fresnel_schlick", rounded), missed=["Schlick, F0 = 0.04"])
-by_itself = (microfacet, "beckmann_d", steep_gradient)
-in_lobes = (lobes, "beckmann_d", steep_gradient)
-loss("gradient", "bsdf", by_itself, in_lobes, missed=["gradient in alpha, p99.9"])
+by_itself = (microfacet.Beckmann, "d", steep_gradient)
+loss("gradient", "bsdf", by_itself, missed=["gradient in alpha, p99.9"])
 shadows = ["spheres, shadow rays", "cones, shadow rays"]
 loss("offset", "geometry", (hit_errors, "CURVED", 0.0), missed=shadows)
 damaged = [f"nan or inf in a picture, blur ({variant}_rgb)" for variant in ("llvm_ad", "scalar")]

@@ -134,6 +134,7 @@ def reason(name: str, why: str, **content: Any) -> None:
 
 
 EXACT_CONE = {**CONE, "bsdf": {"type": "mrt_bsdf", "fresnel": "dielectric"}}
+GGX_CONE = {**CONE, "bsdf": {"type": "mrt_bsdf", "distribution": "ggx"}}
 UNCLAMPED = {"type": "mrt_whitted", "clamp": False}
 SHALLOW = {"type": "mrt_whitted", "max_depth": 1}
 ROUGH_IN_PLACES = {**SPHERE, "bsdf": {"type": "mrt_bsdf", "alpha": TEXTURE}}
@@ -161,7 +162,13 @@ reason("two_sided", "no material is lit from behind", a=SPHERE)
 INSTANCE = {"type": "instance", "of": {"type": "ref", "id": "inside"}}
 reason("merged", "instances in the scene", a=SPHERE, inside={"type": "shapegroup", "b": MESH}, c=INSTANCE)
 reason("merged", "a material other than mrt_bsdf", a={"type": "sphere"})
-reason("merged", "materials of different Fresnel formulas", a=SPHERE, b=EXACT_CONE)
+reason("merged", 'materials of different "fresnel"', a=SPHERE, b=EXACT_CONE)
+reason(
+    "merged",
+    'materials of different "distribution"',
+    a=SPHERE,
+    b={**CONE, "bsdf": {"type": "mrt_bsdf", "distribution": "ggx"}},
+)
 reason("merged", "a material varies over its surface", a=GROUP)
 reason("merged", "a material varies over its surface", a=ROUGH_IN_PLACES)
 

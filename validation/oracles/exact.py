@@ -63,12 +63,6 @@ def fresnel(form: str, cos_theta: Number, ext_ior: Number, int_ior: Number) -> N
     return fresnel_schlick(cos_theta, f0_from_ior(ext_ior, int_ior)) if form == "schlick" else mpf(1)
 
 
-def beckmann_d(cos_theta_h: Number, alpha: Number) -> Number:
-    c = number(cos_theta_h)
-    a = number(alpha)
-    return mp.exp(-(1 / c**2 - 1) / a**2) / (mp.pi * a**2 * c**4)
-
-
 def steepness(v: Sequence[Number], alpha: Number) -> Number:
     """1 / (alpha tan θ) of a direction above the surface, infinite along the normal."""
     x, y, z = map(number, v)
@@ -76,19 +70,54 @@ def steepness(v: Sequence[Number], alpha: Number) -> Number:
     return z / across if across else mp.inf
 
 
-def smith_g1(v: Sequence[Number], alpha: Number) -> Number:
-    """The rational fit of Walter et al. for a direction above the surface."""
-    b = steepness(v, alpha)
-    if b >= mpf("1.6"):
-        return mpf(1)
-    return (mpf("3.535") * b + mpf("2.181") * b**2) / (1 + mpf("2.276") * b + mpf("2.577") * b**2)
+class Beckmann:
+    """Beckmann's microfacets, with the rational fit of Smith's G₁ by Walter et al. (2007)."""
+
+    @staticmethod
+    def d(cos_theta_h: Number, alpha: Number) -> Number:
+        """The density of normals; Walter et al., eq. 25."""
+        c = number(cos_theta_h)
+        a = number(alpha)
+        return mp.exp(-(1 / c**2 - 1) / a**2) / (mp.pi * a**2 * c**4)
+
+    @staticmethod
+    def g1(v: Sequence[Number], alpha: Number) -> Number:
+        """The rational fit, for a direction above the surface; Walter et al., eq. 27."""
+        b = steepness(v, alpha)
+        if b >= mpf("1.6"):
+            return mpf(1)
+        return (mpf("3.535") * b + mpf("2.181") * b**2) / (1 + mpf("2.276") * b + mpf("2.577") * b**2)
+
+    @staticmethod
+    def visible_cos(v: Sequence[Number], alpha: Number) -> Number:
+        """(1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
+        a = steepness(v, alpha)
+        smith = (mp.exp(-a * a) / (a * mp.sqrt(mp.pi)) - mp.erfc(a)) / 2
+        return (1 + smith) * number(v[2])
 
 
-def visible_cos(v: Sequence[Number], alpha: Number) -> Number:
-    """(1 + Λ) cos θ of a direction above the surface, with Beckmann's own Λ (Heitz 2014, eq. 72)."""
-    a = steepness(v, alpha)
-    smith = (mp.exp(-a * a) / (a * mp.sqrt(mp.pi)) - mp.erfc(a)) / 2
-    return (1 + smith) * number(v[2])
+class GGX:
+    """Microfacets of Trowbridge and Reitz with Smith's G₁ (Walter et al. 2007)."""
+
+    @staticmethod
+    def d(cos_theta_h: Number, alpha: Number) -> Number:
+        """The density of normals; Walter et al., eq. 33."""
+        c = number(cos_theta_h)
+        a = number(alpha)
+        return a**2 / (mp.pi * c**4 * (a**2 + 1 / c**2 - 1) ** 2)
+
+    @staticmethod
+    def g1(v: Sequence[Number], alpha: Number) -> Number:
+        """Smith's shadowing of a direction above the surface; Walter et al., eq. 34."""
+        return 2 / (1 + mp.sqrt(1 + 1 / steepness(v, alpha) ** 2))
+
+    @staticmethod
+    def visible_cos(v: Sequence[Number], alpha: Number) -> Number:
+        """(1 + Λ) cos θ of a direction above the surface; Λ is that of ``g1`` (Heitz 2014, eq. 72)."""
+        return number(v[2]) / GGX.g1(v, alpha)
+
+
+DISTRIBUTIONS: dict[str, type[Beckmann | GGX]] = {"beckmann": Beckmann, "ggx": GGX}
 
 
 class Lobe(NamedTuple):
@@ -100,10 +129,11 @@ class Lobe(NamedTuple):
     value: Number  #: D G / (4 cos θi)
 
 
-def lobe(wi: Sequence[Number], wo: Sequence[Number], alpha: Number) -> Lobe:
+def lobe(wi: Sequence[Number], wo: Sequence[Number], alpha: Number, distribution: str = "beckmann") -> Lobe:
     """The lobe for directions above the surface; their half vector is the sum of their components."""
     x, y, z = (number(p) + number(q) for p, q in zip(wi, wo, strict=True))
     tan2 = (x * x + y * y) / (z * z)
-    d = beckmann_d(1 / mp.sqrt(1 + tan2), alpha)
-    g = smith_g1(wi, alpha) * smith_g1(wo, alpha)
+    microfacets = DISTRIBUTIONS[distribution]
+    d = microfacets.d(1 / mp.sqrt(1 + tan2), alpha)
+    g = microfacets.g1(wi, alpha) * microfacets.g1(wo, alpha)
     return Lobe(tan2, d, g, d * g / (4 * number(wi[2])))
