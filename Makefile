@@ -6,7 +6,8 @@
 # make pictures [ARGS="check"]          the pictures of README anew, in docs/pictures
 # make browser                         site, reports and pages of checks as an installed Chromium shows them
 # make bench  [ARGS="--compare F"]      time scenes 0-4 into out/bench.json
-# make test-gpu, make bench-gpu        the tests of what runs on a device, and its times, on an NVIDIA GPU
+# make device-check                    pictures and tests on an NVIDIA GPU, in five minutes at most
+# make bench-gpu                       times on an NVIDIA GPU
 # make setup                            the environment alone: .venv with the commands mrt and mrt-validate
 # make develop                          the same with all that tests, documentation and style need
 # make lint, make types, make package   style, types, wheel and sdist
@@ -21,7 +22,7 @@ BIN  := $(VENV)/bin
 # One stamp per set of extras: installing one leaves the others as they are.
 STAMP := $(VENV)/.mrt
 
-.PHONY: setup develop render test test-gpu fuzz attack bench bench-gpu docs pictures browser lint types package clean
+.PHONY: setup develop render test device-check fuzz attack bench bench-gpu docs pictures browser lint types package clean
 setup: $(STAMP)-base
 
 develop: $(STAMP)-all
@@ -44,8 +45,8 @@ bench: $(STAMP)-test
 	$(BIN)/python -m mrt_mitsuba.validation.bench --out $(OUT)/bench.json $(ARGS)
 
 DEVICE ?= cuda
-test-gpu: $(STAMP)-test
-	MRT_DEVICE=$(DEVICE) $(BIN)/python -m pytest -m "device and not package" $(ARGS)
+device-check: $(STAMP)-test
+	$(BIN)/python -m mrt_mitsuba.validation.device $(ARGS)
 
 bench-gpu: $(STAMP)-test
 	@mkdir -p $(OUT)

@@ -50,7 +50,7 @@ def run_command(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str
     return run
 
 
-# Where tests in a vectorised variant run: "llvm", or "cuda" with make test-gpu
+# Where tests in a vectorised variant run: "llvm", or "cuda" with make device-check
 DEVICE = os.environ.get("MRT_DEVICE", "llvm")
 FAST = runtime.FAST.replace("llvm", DEVICE)
 

@@ -1,4 +1,4 @@
-"""Pictures on a device, against the scalar variants: of make test-gpu on a GPU, else in LLVM."""
+"""Pictures on a device, against the scalar variants: of make device-check on a GPU, else in LLVM."""
 
 from __future__ import annotations
 
@@ -71,13 +71,13 @@ def test_filters_and_updates_on_a_device(variant):
 
 
 @pytest.mark.slow
-def test_make_test_gpu_runs_its_selection_where_it_is_told_to(run_command):
+def test_device_tests_are_selected_where_they_are_asked_for(run_command):
     """And ends with an error where the device is not there."""
     tests = (Path(__file__), Path(__file__).parents[1] / "unit" / "test_parameters.py")
     words = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "device", "--co", *tests)
     found = run_command(*words, MRT_DEVICE="llvm").stdout
     assert "test_light_buffers_follow_the_light" in found
-    assert "test_make_test_gpu" not in found  # no picture, no device
+    assert "test_device_tests_are_selected" not in found  # no picture, no device
     if "cuda_ad_rgb" not in mi.variants() or runtime.obstacle("cuda_ad_rgb"):
         missing = run_command(*words, MRT_DEVICE="cuda", code=1)
         assert "needs an NVIDIA GPU" in missing.stdout + missing.stderr
