@@ -26,7 +26,7 @@ from mrt_mitsuba.adaptive.error import DOUBTFUL, ErrorEstimate, tail_shape
 from mrt_mitsuba.filters.dof import REACH
 from mrt_mitsuba.filters.grid import dilated, window_means
 from mrt_mitsuba.plugins import plugin
-from mrt_mitsuba.rendering.exposing import Exposer, FilmStarts, Groups, Stack, widened
+from mrt_mitsuba.rendering.exposing import Exposer, FilmAccumulator, RayBatch, film_samples, widened
 from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.rendering.progress import Advance
 
@@ -104,8 +104,8 @@ class State:
     total: np.ndarray  #: sums of colours, [3, 4, H, W]
     square: np.ndarray  #: sums of squares, the mean of the colours, [4, H, W]
     peak: np.ndarray  #: the mean colour of the brightest ray, [4, H, W]
-    halves: Stack
-    scouts: Stack | None  #: as a filter has them; None under a box
+    halves: FilmAccumulator
+    scouts: FilmAccumulator | None  #: as a filter has them; None under a box
     bad: np.ndarray  #: met a ray whose colour is no number, or has no square, [H, W]
     unfit: float  #: the largest of such colours
     earlier: np.ndarray | None  #: ``differences`` of the halves a round before, [2, H, W]
@@ -120,8 +120,8 @@ class State:
             total=np.zeros((3, *four), np.float32),
             square=np.zeros(four),
             peak=np.zeros(four, np.float32),
-            halves=Stack.blank(film, 2, channels),
-            scouts=Stack.blank(film, 2, 3) if film.reach else None,
+            halves=FilmAccumulator.blank(film, 2, channels),
+            scouts=FilmAccumulator.blank(film, 2, 3) if film.reach else None,
             bad=np.zeros(film.shape, bool),
             unfit=0.0,
             earlier=None,
@@ -313,9 +313,9 @@ class RayNoise:
         return np.concatenate([widened(self.film, chosen[:2]), chosen[2:]])
 
     def trace(self, state: State, chosen: np.ndarray, advance: Advance) -> State:
-        groups = Groups.shared_out(self._group, self._traced(chosen), state.rays)
-        starts = FilmStarts(self.film, self._seed, self._sampler)
-        exposed = self._exposer.expose(groups, starts, pictures=4, moments=True, advance=advance)
+        groups = RayBatch.from_counts(self._group, self._traced(chosen), state.rays)
+        samples = film_samples(self.film, self._seed, self._sampler)
+        exposed = self._exposer.expose(groups, samples, pictures=4, moments=True, advance=advance)
         total, peak = exposed.total, exposed.peak
         square = exposed.square.mean(0)
         bad, unfit = state.bad, state.unfit
@@ -331,9 +331,9 @@ class RayNoise:
         if state.rays.all():
             earlier = state.differing
         with np.errstate(invalid="ignore"):
-            halves = state.halves.plus(exposed, chosen[:2] > 0)
+            halves = state.halves.accumulate(exposed, chosen[:2] > 0)
             if scouts is not None:
-                scouts = scouts.plus(exposed, chosen[2:] > 0, first=2)
+                scouts = scouts.accumulate(exposed, chosen[2:] > 0, first=2)
         return State(
             rays=state.rays + exposed.rays.reshape(state.rays.shape),
             total=state.total + total,
@@ -371,7 +371,7 @@ class RayNoise:
     def variance(self, state: State) -> np.ndarray:
         each = self._variance_of_rays(state, state.sums(0, 2), state.sums(1, 3), missed=2 * MISSED)
         each *= (1 / state.rays[:2]).sum(0) / 4
-        total = _calibrated(self.film.spread_out(each), state.channels.mean(0))
+        total = _calibrated(self.film.filtered_variance(each), state.channels.mean(0))
         near = window_means(state.channels, 4) + 1e-30
         variance = np.moveaxis(total * near / near.mean(0), 0, -1)
         rounding = np.square(2.0**-24 * state.image()[..., :3], dtype=np.float64)
@@ -406,8 +406,8 @@ class RayNoise:
         if near is None:
             near = _nearby(differences(first, second), WINDOWS[3:])
         found, expected = np.moveaxis(near, -3, 0)
-        ratio = self.film.even * found / np.maximum(expected, 1e-30) + self._uneven(state)
-        return np.asarray(mixed * ratio * np.float32(self.film.averaging * state.unit))
+        ratio = self.film.between_pixel_share * found / np.maximum(expected, 1e-30) + self._uneven(state)
+        return np.asarray(mixed * ratio * np.float32(self.film.filter_variance_ratio * state.unit))
 
     def _uneven(self, state: State) -> float:
         """What the filter's change within a pixel adds to the ratio of a pixel's variance to that of
@@ -417,11 +417,11 @@ class RayNoise:
         """
         if state.scouts is None:
             return 0.0
-        rest = 1 - self.film.even
+        rest = 1 - self.film.between_pixel_share
         found, expected = differences(state.sums(2), state.sums(3)).mean((1, 2), dtype=np.float64)
         squares = quarter_squares(*state.scouts.pictures()).mean(-1)
         seen = np.where(state.unknown, 0, squares).mean() / state.unit
-        added = seen / self.film.averaging - self.film.even * found
+        added = seen / self.film.filter_variance_ratio - self.film.between_pixel_share * found
         return float(np.clip(added / max(expected, 1e-300), 0, rest))
 
     def _around(self, values: np.ndarray) -> np.ndarray:

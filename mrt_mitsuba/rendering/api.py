@@ -28,7 +28,7 @@ from mrt_mitsuba.files.layers import TABLE as LAYER_TABLE
 from mrt_mitsuba.interrupts import held
 from mrt_mitsuba.machine import Budget, Workspace
 from mrt_mitsuba.options import Values
-from mrt_mitsuba.rendering.exposing import OWN
+from mrt_mitsuba.rendering.exposing import FILM_PREFIX
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, make_plan
 from mrt_mitsuba.rendering.progress import Job, Progress, Timings, default_progress
@@ -263,11 +263,11 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
         shader = Shader(source, settings.motion)
         plan = make_plan(source, shader, settings)
         workspace = Workspace.next_to(
-            plan.seen.width,
-            plan.seen.height,
+            plan.padded_region.width,
+            plan.padded_region.height,
             plan.channels,
             pictures=min(plan.frames, 2),  # the frames' sum, and one of them
-            rays_per_pixel=max(step.places.size for step in plan.passes),
+            rays_per_pixel=max(step.pattern.size for step in plan.passes),
             budget=job.budget,
         )
         job.start(plan, workspace)
@@ -310,7 +310,7 @@ def _frames(shader: Shader, plan: Plan, job: Job) -> Passes:
         following.run()
         for name in averaged:
             layers[name] += following.layers[name]
-    inside = plan.region.inside(plan.seen)
+    inside = plan.region.inside(plan.padded_region)
     for name, values in layers.items():
         if plan.frames > 1 and name in averaged:
             values /= np.float32(plan.frames)
@@ -323,7 +323,11 @@ def _channels(layers: Mapping[str, np.ndarray], plan: Plan) -> dict[str, Image]:
 
     A layer of ours is left out where the integrator has a channel of the same name.
     """
-    own = {name.removeprefix(OWN): layer[..., 0] for name, layer in layers.items() if name.startswith(OWN)}
+    own = {
+        name.removeprefix(FILM_PREFIX): layer[..., 0]
+        for name, layer in layers.items()
+        if name.startswith(FILM_PREFIX)
+    }
     channels = dict(own)
     for name in sorted(layers.keys() & plan.layers):
         letters = LAYER_TABLE[name].letters

@@ -1,17 +1,17 @@
-"""Exposing pixels: tracing groups of rays in chosen ones, and adding up their values.
+"""Tracing batches of rays in chosen pixels, and adding up their values.
 
-Where rays start is up to an object with ``start``: given pixels, the numbers of rays among all of their pixel
-and how many groups were in earlier wavefronts, it gives a ``Start``. There is one for a lattice, one for the
-sampler of a scene and one for any other sampling of a film. Values of rays add up to means over the rays of
-each pixel of a lattice, or on a ``Canvas`` to sums under the filter of a film. In vectorised variants rays
-are traced in wavefronts, split where they would not fit into memory; in scalar variants by a loop in Python.
+A function of pixels and ray numbers says where rays start: on a lattice, where random numbers place them on a
+film, or where the scene's sampler does. Values are averaged over the rays of each pixel of a lattice, or
+accumulated on a ``Canvas`` under the film's filter. Vectorised variants trace wavefronts that fit into memory
+and are short enough for progress to show; scalar variants trace ray by ray in Python.
 """
 
 from __future__ import annotations
 
 import logging
+import time
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from mrt_mitsuba.filters.grid import dilated
 from mrt_mitsuba.interrupts import heed
 from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY
 from mrt_mitsuba.rendering.canvas import Canvas
-from mrt_mitsuba.rendering.film import Film, Places, divide, opaque
+from mrt_mitsuba.rendering.film import Film, SamplePattern, divide, opaque
 from mrt_mitsuba.rendering.plan import Pass
 from mrt_mitsuba.rendering.progress import Advance, Job
 from mrt_mitsuba.rendering.seeds import derived_seed
@@ -33,24 +33,25 @@ from mrt_mitsuba.rendering.shading import RayValues, Shader
 
 log = logging.getLogger(__name__)
 
-# Of rays, by channel: mi.Float, in scalar variants np.ndarray
-Values = list[Any]
-OWN = "own:"  # begins what is no layer's name: the channels of the film and the integrator
+Values = list[Any]  # of rays, by channel: mi.Float, in scalar variants np.ndarray
+FILM_PREFIX = "film:"  # of the names of channels of the film and the integrator, which are no layers
+WAVEFRONT = 2**19  # rays of the first wavefront of a pass; later ones take QUICK to SLOW seconds each
+QUICK, SLOW = 0.25, 1.0
 
 
 @dataclass(frozen=True)
-class Groups:
-    """Groups of ``size`` rays, each in one entry of a list of pixels."""
+class RayBatch:
+    """Rays in groups of ``size``, each group belonging to an entry of a list of pixels."""
 
     size: int
     pixels: Any  #: of each entry: numbers row by row, those of a second picture after those of the first
     #: [2, entries], the number of groups and the number of their first ray among all of the pixel; None: one
     #: group for each entry, which begins with ray 0
-    shares: np.ndarray | None = None
-    before: int = 0  #: groups in earlier wavefronts
+    counts_and_first: np.ndarray | None = None
+    first_group: int = 0  #: number of groups in earlier wavefronts
 
     @classmethod
-    def shared_out(cls, size: int, counts: np.ndarray, before: np.ndarray) -> Groups:
+    def from_counts(cls, size: int, counts: np.ndarray, before: np.ndarray) -> RayBatch:
         """``counts`` groups in each picture and pixel, [pictures, pixels], after ``before`` rays there."""
         chosen = np.flatnonzero(counts)
         shares = np.stack([counts.ravel()[chosen], before.ravel()[chosen]])
@@ -59,7 +60,7 @@ class Groups:
     @property
     def count(self) -> int:
         """Number of groups."""
-        return len(self.pixels) if self.shares is None else int(self.shares[0].sum())
+        return len(self.pixels) if self.counts_and_first is None else int(self.counts_and_first[0].sum())
 
     @property
     def rays(self) -> int:
@@ -71,16 +72,17 @@ class Groups:
         rays = np.zeros(pixels, np.int64)
         given = self.pixels
         at = slice(given.start, given.stop) if isinstance(given, range) else given
-        rays[at] = self.size if self.shares is None else self.size * self.shares[0]
+        rays[at] = self.size if self.counts_and_first is None else self.size * self.counts_and_first[0]
         return rays
 
-    def parts(self, most: int, width: int) -> Iterator[tuple[slice, Groups]]:
-        """Cut into parts of no more than ``most`` groups, between rows where that can be.
+    def parts(self, limit: Callable[[], int], width: int) -> Iterator[tuple[slice, RayBatch]]:
+        """Cut into parts of at most ``limit()`` groups, between rows of ``width`` pixels where possible.
 
         Yields the entries in each part, and their groups.
         """
         pixels = self.pixels
-        shares = self.shares
+        shares = self.counts_and_first
+        most = limit()
         if shares is not None and shares[0].max(initial=0) > most:
             # several entries for a pixel of more groups
             pieces = -(-shares[0] // most)
@@ -91,23 +93,23 @@ class Groups:
         # groups up to the end of each entry
         ends: Any = range(1, len(pixels) + 1) if shares is None else np.cumsum(shares[0])
         start = 0
-        before = 0
+        done = 0
         while start < len(pixels):
-            stop = bisect_right(ends, before + most)
+            stop = max(bisect_right(ends, done + limit()), start + 1)
             if stop < len(pixels):
                 row = bisect_left(pixels, pixels[stop] // width * width)
                 stop = row if row > start else stop
             part = slice(start, stop)
-            yield part, Groups(self.size, pixels[part], None if shares is None else shares[:, part], before)
-            before = int(ends[stop - 1])
+            yield part, RayBatch(self.size, pixels[part], None if shares is None else shares[:, part], done)
+            done = int(ends[stop - 1])
             start = stop
 
     def lanes(self) -> tuple[mi.UInt32, mi.UInt32]:
         """The pixel of each ray, and its number among all rays of the pixel."""
         ray = dr.arange(mi.UInt32, self.rays)
         entry, number = divide(ray, self.size)
-        if self.shares is not None:
-            counts, first = self.shares
+        if self.counts_and_first is not None:
+            counts, first = self.counts_and_first
             starts = np.cumsum(counts) - counts  # the first group of each entry
             begins = dr.zeros(mi.UInt32, self.count)
             dr.scatter(begins, mi.UInt32(1), mi.UInt32(starts))
@@ -121,126 +123,115 @@ class Groups:
 # ------------------------------------------ Where rays start ------------------------------------------
 
 
-class Start(NamedTuple):
+class CameraSample(NamedTuple):
     """Where and when rays start, one or one in each lane."""
 
-    film: mi.Point2f | None  #: place on the film, in pixels; None on a lattice
-    picture: mi.Point2f  #: place in the picture, [0, 1]²
+    film: mi.Point2f | None  #: position on the film, in pixels; None on a lattice
+    picture: mi.Point2f  #: position in the picture, [0, 1]²
     time: mi.Float | None  #: from 0, when the shutter opens, to 1; None: the sampler draws it
-    sampler: mi.Sampler | None  #: of all else that is random; None where nothing is
+    sampler: mi.Sampler | None  #: of all other random numbers; None where there are none
 
 
-def ray_sampler(rays: int) -> mi.Sampler:
-    """Independent random numbers, as Mitsuba numbers the rays of a whole picture, ``rays`` in each pixel."""
-    return mi.load_dict({"type": "mrt_rays", "rays": rays})
+# Of pixels, the numbers of rays among all of their pixel, and the number of groups in earlier wavefronts
+Samples = Callable[[Any, Any, int], CameraSample]
 
 
-@dataclass(frozen=True)
-class LatticeStarts:
-    """Rays start at the samples of a lattice, in a picture of this size."""
+def lattice_samples(pattern: SamplePattern, shader: Shader, seed: Any) -> Samples:
+    """Return the samples of a lattice; ``seed``: a number, or an array of one."""
+    random = shader.random or mi.is_spectral or shader.sensor.needs_aperture_sample()
+    sampler = mi.load_dict({"type": "mrt_rays", "rays": pattern.size}) if random else None
 
-    places: Places
-    width: int
-    height: int
-    seed: Any  #: a number, or an array of one
-    sampler: mi.Sampler | None  #: of what else is random; None where nothing is
+    def at(pixel: mi.UInt32, number: mi.UInt32, first_group: int) -> CameraSample:
+        if sampler is not None:
+            sampler.start_in(seed, pixel, number)
+        return CameraSample(None, *pattern.at(pixel, number, shader.width, shader.height), sampler)
 
-    def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
-        if self.sampler is not None:
-            self.sampler.start_in(self.seed, pixel, number)
-        return Start(None, *self.places.at(pixel, number, self.width, self.height), self.sampler)
+    return at
 
 
-@dataclass(frozen=True)
-class FilmStarts:
-    """Rays start in the pixels of a film where random numbers place them."""
+def film_samples(film: Film, seed: Any, sampler: mi.Sampler) -> Samples:
+    """Return samples that a sampler of ``adaptive/samplers.py`` places in the pixels of several pictures."""
 
-    film: Film
-    seed: Any  #: a number, or an array of one
-    sampler: mi.Sampler  #: one of ``adaptive/samplers.py``
+    def at(pixel: mi.UInt32, number: mi.UInt32, first_group: int) -> CameraSample:
+        sampler.start_in(seed, pixel, number)
+        inside = divide(pixel, film.pixels)[1]
+        return CameraSample(*film.place(inside, sampler), None, sampler)
 
-    def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
-        self.sampler.start_in(self.seed, pixel, number)
-        inside = divide(pixel, self.film.pixels)[1]
-        return Start(*self.film.place(inside, self.sampler), None, self.sampler)
+    return at
 
 
-@dataclass(frozen=True)
-class SceneStarts:
-    """Rays start in the pixels of a film where the sampler of its scene places ``rays`` of each pixel."""
+def scene_samples(film: Film, seed: Any, rays: int) -> Samples:
+    """Return ``rays`` samples of each pixel, placed by the scene's sampler.
 
-    film: Film
-    seed: Any  #: a number, or an array of one
-    rays: int
-    independent: mi.Sampler | None  #: in place of Mitsuba's of this name; None: the scene has another
+    Mitsuba's ``independent`` is replaced by one whose numbers do not depend on how wavefronts are cut.
+    """
+    if film.independent:
+        return film_samples(film, seed, mi.load_dict({"type": "mrt_rays", "rays": rays}))
 
-    def start(self, pixel: mi.UInt32, number: mi.UInt32, before: int) -> Start:
-        if self.independent is not None:
-            sampler = self.independent
-            sampler.start_in(self.seed, pixel, number)
-        else:
-            sampler = self.film.sensor.sampler().clone()
-            sampler.set_sample_count(self.rays)
-            sampler.set_samples_per_wavefront(self.rays)
-            sampler.seed(derived_seed(self.seed, wavefront=before), dr.width(pixel))
-        return Start(*self.film.place(pixel, sampler), None, sampler)
+    def at(pixel: mi.UInt32, number: mi.UInt32, first_group: int) -> CameraSample:
+        sampler = film.sensor.sampler().clone()
+        sampler.set_sample_count(rays)
+        sampler.set_samples_per_wavefront(rays)
+        sampler.seed(derived_seed(seed, wavefront=first_group), dr.width(pixel))
+        return CameraSample(*film.place(pixel, sampler), None, sampler)
 
-
-Starts = LatticeStarts | FilmStarts | SceneStarts
+    return at
 
 
 # ---------------------------------------- What values add up to ----------------------------------------
 
 
 @dataclass(frozen=True)
-class Stack:
-    """Pictures in the making, exposure upon exposure.
+class FilmAccumulator:
+    """Accumulates exposures of several pictures of one film.
 
-    An exposure may leave pixels out. It counts in proportion to the independent rays that it brings to a
-    pixel, and only where none is missing under the filter; the rays of a pixel have the same weight in all.
+    An exposure may leave pixels out. It is weighted by the independent rays that it brings to a pixel, and
+    counts only where none is missing under the filter; all rays of a pixel have the same weight.
     """
 
     film: Film
     sums: np.ndarray  #: filtered values times their weights, [channels, pictures, H, W]
     weights: np.ndarray  #: sums of these weights, [pictures, H, W]
-    amount: np.ndarray  #: sums of the weights of exposures, [pictures, H, W]
+    exposure_weight: np.ndarray  #: sums of the weights of exposures, [pictures, H, W]
 
     @classmethod
-    def blank(cls, film: Film, pictures: int, channels: int) -> Stack:
-        """Pictures that nothing was exposed to."""
+    def blank(cls, film: Film, pictures: int, channels: int) -> FilmAccumulator:
+        """Return an empty accumulator."""
         sums = np.zeros((channels, pictures, *film.shape), np.float32)
         return cls(film, sums, np.zeros_like(sums[0]), np.zeros_like(sums[0]))
 
     @np.errstate(over="ignore", invalid="ignore")  # of light beyond float32, whose mean is infinite
-    def plus(self, exposed: Canvas, chosen: np.ndarray, first: int = 0) -> Stack:
-        """With as many pictures of an exposure as there are ``chosen`` pixels for, [pictures, pixels], from
-        the ``first`` on."""
+    def accumulate(self, exposed: Canvas, chosen: np.ndarray, first: int = 0) -> FilmAccumulator:
+        """Return the sums with an exposure of the ``chosen`` pixels, [pictures, pixels], added.
+
+        ``first``: the picture of the exposure that belongs to the first one here.
+        """
         some = slice(first, first + len(chosen))
         each = np.float32(1 / np.maximum(exposed.rays[some], 1))  # variance of a pixel's mean, up to a factor
-        shape = self.amount.shape
-        amount = chosen.reshape(shape) / self.film.spread_out(each.reshape(shape))
+        shape = self.exposure_weight.shape
+        exposure_weight = chosen.reshape(shape) / self.film.filtered_variance(each.reshape(shape))
         return replace(
             self,
-            sums=self.sums + amount * exposed.sums[: len(self.sums), some],
-            weights=self.weights + amount * exposed.weights[some],
-            amount=self.amount + amount,
+            sums=self.sums + exposure_weight * exposed.sums[: len(self.sums), some],
+            weights=self.weights + exposure_weight * exposed.weights[some],
+            exposure_weight=self.exposure_weight + exposure_weight,
         )
 
     def pictures(self) -> np.ndarray:
-        """The pictures one by one, [pictures, H, W, channels], with the film's border."""
+        """Return each picture, [pictures, H, W, channels], with the film's border."""
         weights = np.where(self.weights == 0, 1, self.weights)
         return np.moveaxis(self.sums / weights, 0, -1)
 
     def mean(self) -> np.ndarray:
-        """The mean of the pictures, each counting alike, [H, W, channels], without the border."""
-        amount = np.maximum(self.amount, 1e-30)
-        sums = (self.sums / amount).sum(1)
-        weights = (self.weights / amount).sum(0)
+        """Return the unweighted mean of the pictures, [H, W, channels], without the film's border."""
+        exposure_weight = np.maximum(self.exposure_weight, 1e-30)
+        sums = (self.sums / exposure_weight).sum(1)
+        weights = (self.weights / exposure_weight).sum(0)
         return self.film.picture(np.moveaxis(sums / np.where(weights == 0, 1, weights), 0, -1))
 
 
 def widened(film: Film, counts: np.ndarray) -> np.ndarray:
-    """Counts [pictures, pixels], at least one wherever the film's filter reaches from."""
+    """Return counts [pictures, pixels], raised to 1 in pixels within the filter's reach of a count."""
     if not film.reach:
         return counts
     near = dilated(counts.reshape(-1, *film.shape) > 0, film.reach)
@@ -248,7 +239,7 @@ def widened(film: Film, counts: np.ndarray) -> np.ndarray:
 
 
 def _over_rays(plane: Any, size: int, first: bool) -> np.ndarray:
-    """The sum over the ``size`` rays of each pixel, or the value of the first ray, [pixels]."""
+    """Return the sum over the ``size`` rays of each pixel, or the value of the first ray, [pixels]."""
     if first or size == 1:
         return np.asarray(plane)[::size]
     if isinstance(plane, np.ndarray):
@@ -259,20 +250,20 @@ def _over_rays(plane: Any, size: int, first: bool) -> np.ndarray:
 
 
 class Exposer:
-    """A shader that exposes pixels of a lattice, or of a film.
+    """Traces rays in pixels of a lattice or of a film, and adds up their values.
 
-    ``own``: names of the channels of a film, R, G and B first, and of its integrator. ``names``: of all
-    channels, the own ones first. ``planes``: the layers to expose, of a film next to its picture, each with
-    its places among the channels.
+    ``film_channels``: names of the channels of the film, R, G and B first, and of its integrator. ``names``:
+    of all channels, those first. ``planes``: the layers next to the film's picture, with the places of each
+    among the channels.
     """
 
     def __init__(self, job: Job, shader: Shader, step: Pass) -> None:
-        film = shader.film if step.places.lattice == FILM else None
+        film = shader.film if step.pattern.lattice == FILM else None
         self.job = job
         self.shader = shader
         self.film: Any = film  #: None for a lattice
-        self.own = [*"RGB", *"A" * film.alpha, *film.bands, *shader.aovs] if film else []
-        self.names = list(self.own)
+        self.film_channels = [*"RGB", *"A" * film.alpha, *film.bands, *shader.aovs] if film else []
+        self.names = list(self.film_channels)
         self.planes: dict[str, slice] = {}
         known = ("image", "square") if film else ()  # to a film by itself
         for name, layer in TABLE.items():
@@ -281,39 +272,32 @@ class Exposer:
                 self.names += [f"{name}.{letter}" for letter in layer.letters]
                 self.planes[name] = slice(start, len(self.names))
 
-    def starts(self, places: Places, seed: Any) -> LatticeStarts | SceneStarts:
-        """Where the rays of a pass start; ``seed``: a number, or an array of one."""
-        shader = self.shader
-        film = self.film
-        if film is not None:
-            rays = film.rays_near(places.size)
-            independent = mi.variant().startswith("scalar") or film.sampler == "IndependentSampler"
-            return SceneStarts(film, seed, rays, ray_sampler(rays) if independent else None)
-        random = shader.random or mi.is_spectral or shader.sensor.needs_aperture_sample()
-        sampler = ray_sampler(places.size) if random else None
-        return LatticeStarts(places, shader.width, shader.height, seed, sampler)
+    def samples(self, pattern: SamplePattern, seed: Any) -> Samples:
+        """Return where the rays of a pass start; ``seed``: a number, or an array of one."""
+        if self.film is not None:
+            return scene_samples(self.film, seed, self.film.rays_near(pattern.size))
+        return lattice_samples(pattern, self.shader, seed)
 
     def average(
         self,
-        places: Places,
+        pattern: SamplePattern,
         seed: int,
         pixels: Any,
         layers: Mapping[str, np.ndarray],
         chosen: np.ndarray | None,
         advance: Advance,
     ) -> None:
-        """Trace the rays of a lattice in pixels, and write the mean of each pixel into layers, [pixels,
-        channels] each; into layers of the first hit, what its first ray hit.
+        """Write the mean over the rays of each pixel of a lattice into layers, [pixels, channels] each; into
+        layers of the first hit, the value of the first ray.
 
         ``chosen``: the rows of the pixels in the layers, whose means of earlier samples are averaged with the
-        new ones; None: every row is new. The results do not depend on how memory cuts the rays into
-        wavefronts.
+        new ones; None: every row is new. Results do not depend on how rays are cut into wavefronts.
         """
         channels = len(self.names)
-        known = places.first
-        new = places.count
-        groups = Groups(places.size, pixels)
-        for part, _, _, values in self._wavefronts(groups, self.starts(places, seed), channels):
+        known = pattern.first
+        new = pattern.count
+        groups = RayBatch(pattern.size, pixels)
+        for part, _, _, values in self._wavefronts(groups, self.samples(pattern, seed), channels):
             rows = part if chosen is None else chosen[part]
             for name, planes in self.planes.items():
                 first = TABLE[name].source == FIRST_HIT
@@ -333,42 +317,47 @@ class Exposer:
 
     def expose(
         self,
-        groups: Groups,
-        starts: Starts,
+        groups: RayBatch,
+        samples: Samples,
         *,
         pictures: int = 1,
         moments: bool = False,
         advance: Advance,
     ) -> Canvas:
-        """Trace groups of rays on a film, and add their values up; with ``moments``, the squares of their
-        colours as well."""
+        """Return a canvas with the values of rays; with ``moments``, the squares of their colours, too."""
         film = self.film
         rays = groups.rays_of(pictures * film.pixels).reshape(pictures, -1)
         canvas = Canvas(film, rays, len(self.names), moments=moments)
-        for _, some, place, values in self._wavefronts(groups, starts, 2 * len(self.names)):
+        for _, some, place, values in self._wavefronts(groups, samples, 2 * len(self.names)):
             canvas.put(place, values, some.rays_of(rays.size))
             advance(some.rays)
         return canvas
 
     def _wavefronts(
-        self, groups: Groups, starts: Starts, channels: int
-    ) -> Iterator[tuple[slice, Groups, Any, Values]]:
-        """Trace rays in as many wavefronts as fit into memory, with so many channels of each ray.
+        self, groups: RayBatch, samples: Samples, channels: int
+    ) -> Iterator[tuple[slice, RayBatch, Any, Values]]:
+        """Trace rays in wavefronts, each small enough for ``channels`` values of its rays to fit into memory.
 
-        Yields which of the groups are in a wavefront, these, the places of their rays on the film, and the
-        values.
+        Yields the entries of the groups in a wavefront, these groups, the positions of their rays on the
+        film, and their values.
         """
         width = self.film.width if self.film else self.shader.width
         most = self.job.workspace.rays_at_once(channels)
-        log.debug("tracing %d rays, at most %d at once", groups.rays, most)
-        for part, some in groups.parts(max(1, most // groups.size), width):
+        # the random numbers of Mitsuba's samplers depend on the cuts, which time must not decide
+        rays = most if self.film is not None and not self.film.independent else min(most, WAVEFRONT)
+        start = time.perf_counter()
+
+        def limit() -> int:
+            return max(1, rays // groups.size)
+
+        for part, some in groups.parts(limit, width):
             heed()
             place: Any
             values: Values
             if mi.variant().startswith("scalar"):
-                place, values = self._one_by_one(some, starts)
+                place, values = self._one_by_one(some, samples)
             else:
-                place, values = self.trace(*some.lanes(), starts, some.before)
+                place, values = self.trace(*some.lanes(), samples, some.first_group)
                 if self.film is not None and not self.film.reach:
                     place = None  # a box takes all rays of a pixel alike
                 dr.eval(place, values)
@@ -378,33 +367,42 @@ class Exposer:
                     count = np.sum(np.asarray(values[planes.start]), dtype=np.float64)
                     self.job.rays[TABLE[name].counts] += round(float(count))
             yield part, some, place, values
+            del place, values
+            seconds = time.perf_counter() - start
+            start += seconds
+            if seconds < QUICK:
+                rays = min(2 * rays, most)
+            elif seconds > SLOW:
+                rays = max(rays // 2, min(rays, WAVEFRONT))
 
-    def _one_by_one(self, groups: Groups, starts: Starts) -> tuple[np.ndarray, Values]:
-        """Trace rays in a loop, as scalar variants do."""
+    def _one_by_one(self, groups: RayBatch, samples: Samples) -> tuple[np.ndarray, Values]:
+        """Trace rays in a loop in Python, for scalar variants."""
         places = list[tuple[float, float]]()
         values = list[Values]()
         for entry, pixel in enumerate(groups.pixels):
-            count, first = (1, 0) if groups.shares is None else groups.shares[:, entry].tolist()
+            count, first = (
+                (1, 0) if groups.counts_and_first is None else groups.counts_and_first[:, entry].tolist()
+            )
             for number in range(first, first + groups.size * count):
-                place, traced = self.trace(int(pixel), number, starts, groups.before)
+                place, traced = self.trace(int(pixel), number, samples, groups.first_group)
                 heed()
                 places.append((0, 0) if place is None else (place.x, place.y))
                 values.append(traced)
         return np.array(places).T, list(np.array(values).T)
 
     def trace(
-        self, pixel: mi.UInt32, number: mi.UInt32, starts: Starts, before: int = 0
+        self, pixel: mi.UInt32, number: mi.UInt32, samples: Samples, first_group: int = 0
     ) -> tuple[Any, Values]:
-        """Trace a ray, or one in each lane, for its place on the film, and its values."""
-        start = starts.start(pixel, number, before)
+        """Return the position on the film and the values of a ray, or of one in each lane."""
+        start = samples(pixel, number, first_group)
         rays = self.shader.values(start.picture, start.time, start.sampler)
-        values = [] if self.film is None else self._own(rays)
+        values = [] if self.film is None else self._film_values(rays)
         for name in self.planes:
             values += _channels(TABLE[name].value(rays))
         return start.film, values
 
-    def _own(self, rays: RayValues) -> list[mi.Float]:
-        """The channels of the film and the integrator."""
+    def _film_values(self, rays: RayValues) -> list[mi.Float]:
+        """Return the values of the film's and the integrator's channels."""
         film = self.film
         channels = _channels(mi.Color3f(mi.luminance(rays.image)) if film.grey else rays.image)
         if film.alpha:
@@ -417,6 +415,6 @@ class Exposer:
 
 
 def _channels(value: Any) -> list[mi.Float]:
-    """The channels of a value."""
+    """Return the channels of a value."""
     parts = list(value) if dr.size_v(value) > 1 else [value]
     return [mi.Float(part) for part in parts]

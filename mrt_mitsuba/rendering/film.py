@@ -1,4 +1,4 @@
-"""Places and times at which rays start, on a lattice or by a film's rules, and the film's own filter."""
+"""Positions and times of camera samples, on a lattice or by a film's rules, and the film's filter."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-STEPS = 32  # of a pixel, where integrals over a filter are summed
+FILTER_STEPS_PER_PIXEL = 32  # of a pixel, where integrals over a filter are summed
 
 
 def opaque(number: float, kind: str | None = None) -> mi.Float:
-    """A number as data of a kernel, so that another number needs no other kernel.
+    """Make a number opaque to Dr.Jit, so that changing it does not recompile the kernel.
 
     ``kind``: name of its type in Mitsuba; None: UInt32 for a whole number, else Float.
     """
@@ -32,7 +32,7 @@ def opaque(number: float, kind: str | None = None) -> mi.Float:
 
 
 def divide(n: mi.UInt32, divisor: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """Quotient and remainder of whole numbers below 2³².
+    """Return quotient and remainder of whole numbers below 2³².
 
     A processor divides the integers of a packet one after the other, which takes as long as tracing the ray;
     so vectorised variants multiply by the inverse in double precision. The half added keeps n/d away from
@@ -50,7 +50,7 @@ def _array(variant: str, kind: str, number: float) -> mi.Float:
 
 
 class Region(NamedTuple):
-    """The pixels in columns from ``x`` on and rows from ``y`` on, counted from the top."""
+    """A rectangle of pixels; ``x`` is its first column and ``y`` its first row, counted from the top."""
 
     x: int
     y: int
@@ -58,7 +58,7 @@ class Region(NamedTuple):
     height: int
 
     def grown(self, reach: int, width: int, height: int) -> Region:
-        """The region with so many pixels around it, as far as the picture goes."""
+        """Return the region padded by ``reach`` pixels, cut to the picture."""
         left = max(self.x - reach, 0)
         top = max(self.y - reach, 0)
         right = min(self.x + self.width + reach, width)
@@ -66,25 +66,25 @@ class Region(NamedTuple):
         return Region(left, top, right - left, bottom - top)
 
     def inside(self, other: Region) -> tuple[slice, slice]:
-        """Its rows and columns in an array of another region's pixels."""
+        """Return its rows and columns in an array of another region's pixels."""
         top = self.y - other.y
         left = self.x - other.x
         return slice(top, top + self.height), slice(left, left + self.width)
 
 
 @dataclass(frozen=True)
-class Places:
-    """Samples ``first`` to ``first + count − 1`` in each pixel, each traced ``repeats`` times.
+class SamplePattern:
+    """Samples number ``first`` to ``first + count − 1`` in each pixel, each traced ``repeats`` times.
 
     They lie on a lattice of aa × aa. ``report``: sample (i, j) is at (0.5 + i/aa, 0.5 + j/aa), y upwards, as
     in the original. Sample 0 is the pixel's centre and the others reach into the next pixels, which shifts
     the picture by up to half a pixel. ``centered``: samples are the centres of aa × aa equal cells. ``film``:
     no grid, but as many places that the sampler of a scene draws, see ``Film``.
 
-    The shutter is open from time 0 to 1, which is divided into ``moments`` equal parts; successive rays of a
-    pixel go to different parts, far from each other, so that place and time do not correlate. ``phase`` says
-    where in its part a ray is, 0 to 1. None stands for a random place, the same for all rays of a pixel and
-    another for the next pixel, which turns steps into noise.
+    The shutter is open from time 0 to 1, divided into ``time_strata`` equal strata; successive rays of a
+    pixel go to strata far from each other, so that position and time do not correlate. ``phase``: where in
+    its stratum a ray is, 0 to 1; None: at random, the same for all rays of a pixel and different in the next
+    pixel, which turns steps into noise.
     """
 
     lattice: str = "report"
@@ -92,7 +92,7 @@ class Places:
     first: int = 0
     count: int = 1
     repeats: int = 1
-    moments: int = 0  #: 0: all rays start at time 0
+    time_strata: int = 0  #: 0: all rays start at time 0
     phase: float | None = 0.0
     seed: int = 0  #: of random phases
 
@@ -103,12 +103,12 @@ class Places:
 
     @property
     def holds_centre(self) -> bool:
-        """Is the pixel's centre one of the lattice's samples? It then comes first."""
+        """True if the pixel's centre is one of the lattice's samples, which is then the first."""
         return self.lattice == "report" or (self.lattice == "centered" and self.aa % 2 == 1)
 
     def at(self, pixel: mi.UInt32, ray: mi.UInt32, width: int, height: int) -> tuple[mi.Point2f, mi.Float]:
-        """Where and when rays of pixels start: the place in a picture of this size, [0, 1]², x to the right
-        and y down, and the time."""
+        """Return the positions of rays in a picture of this size, [0, 1]², x to the right and y down, and
+        their times."""
         row, column = divide(pixel, width)
         sample = divide(ray, self.repeats)[0] + opaque(self.first)
         if self.lattice == "centered" and self.holds_centre:
@@ -125,16 +125,16 @@ class Places:
         columns = mi.Float(opaque(width))
         rows = mi.Float(opaque(height))
         place = mi.Point2f((mi.Float(column) + x) / columns, (mi.Float(row) + y) / rows)
-        if not self.moments:
+        if not self.time_strata:
             return place, mi.Float(0)
         if self.phase is None:
             phase = mi.sample_tea_float32(pixel, opaque(self.seed))
         else:
             phase = opaque(float(self.phase))
         # from one ray to the next, so many parts: coprime to their number, near its golden section
-        golden = max(round(self.moments * (math.sqrt(5) - 1) / 2), 1)
-        stride = next(s for s in range(golden, self.moments + 2) if math.gcd(s, self.moments) <= 1)
-        moments = mi.UInt64(opaque(self.moments))
+        golden = max(round(self.time_strata * (math.sqrt(5) - 1) / 2), 1)
+        stride = next(s for s in range(golden, self.time_strata + 2) if math.gcd(s, self.time_strata) <= 1)
+        moments = mi.UInt64(opaque(self.time_strata))
         part = mi.UInt64(ray) * mi.UInt64(opaque(stride)) % moments
         return place, (mi.Float(part) + phase) / mi.Float(moments)
 
@@ -169,20 +169,22 @@ class Film:
             self.bands = tuple(field.name for field in film.bitmap().struct_())
         self.rays = int(sampler.sample_count())  #: of a pixel, as the scene's sampler has them
         self.sampler = sampler.class_name()
+        #: whether rays get independent random numbers, as they always do in scalar variants
+        self.independent = mi.variant().startswith("scalar") or self.sampler == "IndependentSampler"
 
     def picture(self, sampled: np.ndarray) -> np.ndarray:
-        """The picture in an array [..., rows, columns, channels], without the border."""
+        """Return an array [..., rows, columns, channels] without the film's border."""
         rows, columns = (slice(self.border, n - self.border) for n in self.shape)
         return sampled[..., rows, columns, :]
 
     def rays_near(self, count: int) -> int:
-        """The rays of a pixel, by the nearest number that the scene's sampler allows."""
+        """Return the number of rays of a pixel, nearest to ``count``, that the scene's sampler allows."""
         sampler = self.sensor.sampler().clone()
         sampler.set_sample_count(count)
         return int(sampler.sample_count())
 
     def place(self, pixel: mi.UInt32, sampler: mi.Sampler) -> tuple[mi.Point2f, mi.Point2f]:
-        """Places in pixels that a sampler draws: on the film, in pixels, and in the picture, [0, 1]²."""
+        """Draw positions in pixels; return them on the film, in pixels, and in the picture, [0, 1]²."""
         border = float(self.border)
         size = mi.Vector2f(opaque(self.width - 2 * border), opaque(self.height - 2 * border))
         row, column = divide(pixel, self.width)
@@ -191,9 +193,9 @@ class Film:
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """Values of the filter along an axis, ``STEPS`` to a pixel, [2 reach + 1, STEPS]."""
+        """Values of the filter along an axis, [pixels in its reach, ``FILTER_STEPS_PER_PIXEL``]."""
         pixels = np.arange(-self.reach, self.reach + 1)[:, None]
-        places = pixels + (np.arange(STEPS) + 0.5) / STEPS - 0.5
+        places = pixels + (np.arange(FILTER_STEPS_PER_PIXEL) + 0.5) / FILTER_STEPS_PER_PIXEL - 0.5
         flat = places.ravel().tolist()
         if mi.variant().startswith("scalar"):
             values = [self.rfilter.eval(place) for place in flat]
@@ -203,25 +205,27 @@ class Film:
 
     @property
     def correlation(self) -> float:
-        """Sum of the squared correlations of a pixel's error with those of all pixels, itself included."""
+        """Sum of squared correlations of a pixel's error with the errors of all pixels, its own included."""
         values = self.weights.ravel()
-        overlap = np.correlate(values, values, "full")[(len(values) - 1) % STEPS :: STEPS]
+        overlap = np.correlate(values, values, "full")[
+            (len(values) - 1) % FILTER_STEPS_PER_PIXEL :: FILTER_STEPS_PER_PIXEL
+        ]
         return float(np.sum(np.square(overlap / overlap.max()))) ** 2
 
     @property
-    def averaging(self) -> float:
-        """Variance of a pixel over that of the mean of the rays that start in it."""
+    def filter_variance_ratio(self) -> float:
+        """Ratio of a filtered pixel's variance to that of the mean of the rays that start in it."""
         along = np.square(self.weights).mean() / np.square(self.weights.mean())
         return float(along / len(self.weights)) ** 2
 
     @property
-    def even(self) -> float:
-        """Share of a pixel's variance that is left of a filter which has its mean everywhere in a pixel."""
+    def between_pixel_share(self) -> float:
+        """Fraction of the variance that remains if the filter is replaced by its mean in each pixel."""
         along = np.square(self.weights.mean(1)).sum() / np.square(self.weights).mean(1).sum()
         return float(along) ** 2
 
-    def spread_out(self, variance: np.ndarray) -> np.ndarray:
-        """The variance [..., H, W] of pixels, up to a factor, given that of the mean of the rays in each."""
+    def filtered_variance(self, variance: np.ndarray) -> np.ndarray:
+        """Convolve the variance [..., H, W] of pixel means with the squared filter, up to a factor."""
         share = np.square(self.weights).sum(axis=1)
         share = np.float32(share / share.sum())
         for axis in (-2, -1) if self.reach else ():

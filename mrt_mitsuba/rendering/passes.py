@@ -16,7 +16,7 @@ from mrt_mitsuba import filters
 from mrt_mitsuba.files.layers import TABLE
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
-from mrt_mitsuba.rendering.exposing import OWN, Exposer, Groups, Stack, widened
+from mrt_mitsuba.rendering.exposing import FILM_PREFIX, Exposer, FilmAccumulator, RayBatch, widened
 from mrt_mitsuba.rendering.film import Region
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 class Passes:
     """A picture in the making. ``layers``: by name, [H, W, channels] float32; with the channels of the film
-    and the integrator, whose names begin with ``OWN``, [H, W, 1]. ``error`` and ``rounds``: where they were
-    estimated.
+    and the integrator, whose names begin with ``FILM_PREFIX``, [H, W, 1]. ``error`` and ``rounds``: where
+    they were estimated.
 
     A lattice gives each pixel the mean of its samples; a film is exposed with its border, and developed into
     layers. ``frame``: number of the only moment that is seen, where the plan has several frames.
@@ -43,15 +43,15 @@ class Passes:
         self._plan = plan
         self._frame = frame
         self._seed = derived_seed(plan.seed, frame=frame)
-        self._seen = plan.seen.inside(Region(0, 0, plan.width, plan.height))
+        self._seen = plan.padded_region.inside(Region(0, 0, plan.width, plan.height))
         self.layers: dict[str, np.ndarray] = {}
         self.error: ErrorEstimate | None = None
         self.rounds: Sequence[Round] = ()
 
     def run(self) -> None:
         """Run the passes of the plan."""
-        stack: Stack | None = None  # of what a film has been exposed to
-        seen = self._plan.seen
+        stack: FilmAccumulator | None = None  # of what a film has been exposed to
+        seen = self._plan.padded_region
         for step in self._plan.passes:
             if isinstance(step, Edges | Blur):
                 with self._job.stage(step.name, seen.width * seen.height) as advance:
@@ -77,9 +77,9 @@ class Passes:
     def _trace(self, step: Pass, exposer: Exposer) -> None:
         """Trace samples of a lattice: their means are new layers or, at edges, are averaged with these."""
         plan = self._plan
-        phase = self._frame / plan.moments if plan.frames > 1 else step.places.phase
-        places = replace(step.places, seed=self._seed, phase=phase)
-        seen = plan.seen
+        phase = self._frame / plan.time_strata if plan.frames > 1 else step.pattern.phase
+        places = replace(step.pattern, seed=self._seed, phase=phase)
+        seen = plan.padded_region
         width = plan.width
         count = seen.width * seen.height
         pixels: Any = range(seen.y * width, (seen.y + seen.height) * width)
@@ -99,29 +99,29 @@ class Passes:
             variance = np.maximum(self.layers.pop("square") - self.layers["image"] ** 2, 0)
             self.layers["variance"] = variance / (places.size - 1)  # of the means
 
-    def _expose(self, step: Pass, exposer: Exposer, stack: Stack | None) -> Stack:
+    def _expose(self, step: Pass, exposer: Exposer, stack: FilmAccumulator | None) -> FilmAccumulator:
         """Expose the pixels of a film that reach what is seen or, on top of a ``stack``, those at edges."""
         film = exposer.film
         plan = self._plan
-        rays = film.rays_near(step.places.size)
+        rays = film.rays_near(step.pattern.size)
         seed = self._seed
         marked = np.zeros((plan.height, plan.width), bool)
         if stack is None:
-            stack = Stack.blank(film, 1, len(exposer.names))
+            stack = FilmAccumulator.blank(film, 1, len(exposer.names))
             marked[self._seen] = True
         else:
             marked[self._seen] = self.layers["samples"][..., 0] > 1
             seed = derived_seed(plan.seed, frame=self._frame, refinement=1)
         chosen = np.pad(marked, film.border).reshape(1, -1)
         pixels = np.flatnonzero(widened(film, chosen)[0])
-        starts = exposer.starts(step.places, seed)
+        samples = exposer.samples(step.pattern, seed)
         moments = "square" in step.layers
         with self._job.stage(step.name, len(pixels) * rays) as advance:
-            exposed = exposer.expose(Groups(rays, pixels), starts, moments=moments, advance=advance)
-            stack = stack.plus(exposed, chosen)
+            exposed = exposer.expose(RayBatch(rays, pixels), samples, moments=moments, advance=advance)
+            stack = stack.accumulate(exposed, chosen)
         if moments:
             square = exposed.square[:, 0] / rays - (exposed.total[:, 0] / rays) ** 2
-            variance = np.maximum(square, 0) / (rays - 1) * film.averaging
+            variance = np.maximum(square, 0) / (rays - 1) * film.filter_variance_ratio
             self._layer("variance")[:] = film.picture(np.moveaxis(variance, 0, -1))[self._seen]
         self._develop(exposer, stack.mean())
         return stack
@@ -131,7 +131,7 @@ class Passes:
         from mrt_mitsuba.rendering.whole import whole_pictures
 
         film = exposer.film
-        rays = film.rays_near(step.places.size)
+        rays = film.rays_near(step.pattern.size)
         with self._job.stage(step.name, rays * film.pixels) as advance:
             counts, pictures = zip(*whole_pictures(exposer, self._seed, rays, advance), strict=True)
         self._develop(exposer, np.average(pictures, axis=0, weights=counts))
@@ -162,8 +162,8 @@ class Passes:
         """Turn what is exposed, [H, W, channels], into layers."""
         picture = picture[self._seen]
         self._layer("image")[:] = picture[..., :3]
-        for number, name in enumerate(exposer.own[3:], 3):
-            self.layers[OWN + name] = picture[..., number, None].astype(np.float32)
+        for number, name in enumerate(exposer.film_channels[3:], 3):
+            self.layers[FILM_PREFIX + name] = picture[..., number, None].astype(np.float32)
         for name, planes in exposer.planes.items():
             self._layer(name)[:] = picture[..., planes]
 
@@ -215,8 +215,8 @@ class Passes:
         A filter that reads only some rows above and below a pixel, its halo, gives the same bits for a band
         with its halo as for the whole picture.
         """
-        height = self._plan.seen.height
-        width = self._plan.seen.width
+        height = self._plan.padded_region.height
+        width = self._plan.padded_region.width
         most = self._job.workspace.rows_at_once(width)
         step = height if height <= most else max(most - 2 * halo, halo, 1)
         for start in range(0, height, step):
@@ -228,7 +228,7 @@ class Passes:
     def _layer(self, name: str) -> np.ndarray:
         """A layer, of zeros where it is new; all but the picture channel by channel, as an EXR wants them."""
         if name not in self.layers:
-            shape = self._plan.seen.height, self._plan.seen.width
+            shape = self._plan.padded_region.height, self._plan.padded_region.width
             channels = len(TABLE[name].letters)
             planes = np.zeros((*shape, channels) if name == "image" else (channels, *shape), np.float32)
             self.layers[name] = planes if name == "image" else np.moveaxis(planes, 0, -1)

@@ -16,7 +16,7 @@ from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.plugins.whitted import plan as kernel_plan
 from mrt_mitsuba.plugins.whitted.plan import KernelPlan, SceneFacts
-from mrt_mitsuba.rendering.film import Film, Places, Region
+from mrt_mitsuba.rendering.film import Film, Region, SamplePattern
 from mrt_mitsuba.rendering.settings import (
     AA,
     AAMODE,
@@ -48,12 +48,12 @@ class Pass:
 
     name: ClassVar[str]
     layers: frozenset[str] = frozenset()  #: that it traces
-    places: Places = Places()  # noqa: RUF009 - it is frozen  #: where and when its rays start
+    pattern: SamplePattern = SamplePattern()  # noqa: RUF009 - it is frozen  #: where and when its rays start
 
     @property
     def repeated(self) -> str:
         """The number of rays of each sample, in words; empty for one."""
-        return f", {self.places.repeats} rays each" if self.places.repeats > 1 else ""
+        return f", {self.pattern.repeats} rays each" if self.pattern.repeats > 1 else ""
 
 
 class FirstHits(Pass):
@@ -71,9 +71,9 @@ class Exposure(Pass):
     name = "rendering"
 
     def __str__(self) -> str:
-        if self.places.lattice == FILM:
-            return f"{_counted(self.places.size, 'ray')} a pixel, placed and filtered by the film"
-        return f"{_counted(self.places.count, 'sample')} a pixel{self.repeated}{_with(self.layers)}"
+        if self.pattern.lattice == FILM:
+            return f"{_counted(self.pattern.size, 'ray')} a pixel, placed and filtered by the film"
+        return f"{_counted(self.pattern.count, 'sample')} a pixel{self.repeated}{_with(self.layers)}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,10 +95,10 @@ class Refinement(Pass):
     name = "anti-aliasing"
 
     def __str__(self) -> str:
-        if self.places.lattice == FILM:
-            rays = _counted(self.places.size, "ray")
+        if self.pattern.lattice == FILM:
+            rays = _counted(self.pattern.size, "ray")
             return f"{rays} and more in edge pixels, placed and filtered by the film"
-        return f"{self.places.count} further samples in edge pixels{self.repeated}"
+        return f"{self.pattern.count} further samples in edge pixels{self.repeated}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,13 +158,13 @@ class Plan:
     film: str  #: filter and pixel format, where a film is exposed by its own rules rather than a lattice
     bands: tuple[str, ...]  #: spectral ones of the film
     kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
-    parts: SceneFacts | None  #: what the kernels depend on
+    facts: SceneFacts | None  #: what the kernels depend on
     region: Region  #: that is returned
-    seen: Region  #: with the pixels around it that filters look at
+    padded_region: Region  #: with the pixels around it that filters look at
     samples: int  #: of a pixel, where they are refined or everywhere
     channels: int  #: float32 ones kept for every pixel: the picture, its layers, and the detector's
     motion: str | None  #: "frames", "stratified", "film", or None where the camera stands still
-    moments: int  #: while the shutter is open; 0 where the camera stands still
+    time_strata: int  #: while the shutter is open; 0 where the camera stands still
     frames: int  #: pictures to average, each with filters of its own
     seed: int  #: of all random numbers
     layers: frozenset[str]  #: that are returned
@@ -188,19 +188,19 @@ class Plan:
         if (part.width, part.height) != (self.width, self.height):
             lines += [f"  region  {part.width}x{part.height} from column {part.x}, row {part.y}"]
         if self.motion:
-            moments = f"{self.moments} frames"
+            moments = f"{self.time_strata} frames"
             if self.motion == FILM:
                 moments = "each ray at its own moment"
             elif self.motion == "stratified":
-                moments = f"at least {self.moments} moments in a pixel"
+                moments = f"at least {self.time_strata} moments in a pixel"
             lines += [f"  pass    motion blur: {moments}"]
         lines += [f"  pass    {step}" for step in self.passes]
         if self.film:
             lines += [f"  film    {self.film}"]
-        if self.kernel is None or self.parts is None:
+        if self.kernel is None or self.facts is None:
             lines += [f"  kernel  {self.integrator}.sample"]
         else:
-            lines += [f"  kernel  {text}" for text in kernel_plan.contents(self.kernel, self.parts)]
+            lines += [f"  kernel  {text}" for text in kernel_plan.contents(self.kernel, self.facts)]
         for why, group in groupby(self.left_out, lambda left_out: left_out[1]):
             lines += [f"  without {', '.join(what for what, _ in group)}: {why}"]
         return "\n".join(lines)
@@ -296,13 +296,13 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
         film=f"{film.rfilter.class_name()}, {film.pixel_format or 'spectral bands'}" if on_film else "",
         bands=film.bands,
         kernel=shader.kernel,
-        parts=shader.facts,
+        facts=shader.facts,
         region=region,
-        seen=region.grown(reach, source.width, source.height),
+        padded_region=region.grown(reach, source.width, source.height),
         samples=choices.aa**2,
         channels=channels,
         motion=choices.moving,
-        moments=choices.moments,
+        time_strata=choices.moments,
         frames=choices.frames,
         seed=settings.seed,
         layers=returned,
@@ -421,28 +421,28 @@ def _passes(traced: frozenset[str], choices: _Choices, shader: Shader) -> Iterat
     at_centre = frozenset(name for name in traced if TABLE[name].source == FIRST_HIT)
     if at_centre and (on_film or (choices.detector is None and not all_samples.holds_centre)):
         # layers of the first hit belong to the pixel's centre
-        yield FirstHits(layers=at_centre, places=Places(moments=min(choices.moments, 1)))
+        yield FirstHits(layers=at_centre, pattern=SamplePattern(time_strata=min(choices.moments, 1)))
         traced -= at_centre
     if choices.goal:
-        yield Rounds(layers=traced, places=Places(FILM), goal=choices.goal)
+        yield Rounds(layers=traced, pattern=SamplePattern(FILM), goal=choices.goal)
     elif choices.detector is None:
-        yield Exposure(layers=traced, places=all_samples)
+        yield Exposure(layers=traced, pattern=all_samples)
     else:
         # a detector must see no noise: it looks at the centre of each pixel
         places = replace(all_samples, count=1) if on_film else _centre(choices)
         noisy = shader.random and places.repeats == 1 and "image" in DETECTORS[choices.detector]
-        yield Exposure(layers=traced, places=places)
+        yield Exposure(layers=traced, pattern=places)
         yield Edges(detector=choices.detector, noisy=noisy)
         if choices.aa > 1:
             first = 1 if on_film or all_samples.holds_centre else 0  # the centre is not traced again
             places = _samples(choices, first)
-            yield Refinement(layers=traced - at_centre - {"square"}, places=places)
+            yield Refinement(layers=traced - at_centre - {"square"}, pattern=places)
     if choices.focaldist:
         mode = choices.settings.dof
         yield Blur(mode=mode, focal_distance=choices.focaldist, focal_range=choices.focalrange)
 
 
-def _samples(choices: _Choices, first: int = 0) -> Places:
+def _samples(choices: _Choices, first: int = 0) -> SamplePattern:
     """The samples of a pixel from number ``first`` on."""
     repeats = choices.spp
     moments = choices.moments
@@ -450,20 +450,20 @@ def _samples(choices: _Choices, first: int = 0) -> Places:
     stratified = choices.settings.motionmode == "stratified"
     if choices.lattice == FILM:  # each ray has a moment of its own
         wanted = math.ceil(moments / choices.aa**2) if stratified else repeats * moments
-        return Places(FILM, choices.aa, first=first, count=count, repeats=max(repeats, wanted))
+        return SamplePattern(FILM, choices.aa, first=first, count=count, repeats=max(repeats, wanted))
     if moments and stratified:  # every ray of a pixel in a part of its own
         rays = repeats * math.ceil(moments / (count * repeats))
-        return Places(
-            choices.lattice, choices.aa, first, count, repeats=rays, moments=count * rays, phase=None
+        return SamplePattern(
+            choices.lattice, choices.aa, first, count, repeats=rays, time_strata=count * rays, phase=None
         )
     return replace(_centre(choices), lattice=choices.lattice, aa=choices.aa, first=first, count=count)
 
 
-def _centre(choices: _Choices) -> Places:
+def _centre(choices: _Choices) -> SamplePattern:
     """The pixel's centre alone, at the same times in every pixel."""
     moments = choices.moments if choices.frames == 1 else 1
     phase = 0.5 if choices.settings.motionmode == "stratified" else 0.0
-    return Places(repeats=choices.spp * max(moments, 1), moments=moments, phase=phase)
+    return SamplePattern(repeats=choices.spp * max(moments, 1), time_strata=moments, phase=phase)
 
 
 def _left_out(

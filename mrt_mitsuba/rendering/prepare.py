@@ -55,7 +55,7 @@ class Prepared:
             if self._launch is None:
                 return self._render(seed)
             self._exposer.shader = shader = Shader(self._view, None)
-            plan = replace(self._made.plan, parts=shader.facts)
+            plan = replace(self._made.plan, facts=shader.facts)
             if shader.kernel != plan.kernel or self._look() is not self._state:
                 self._render(seed)
                 self._record()
@@ -111,8 +111,8 @@ class Prepared:
             and sensor.shutter_open_time() == 0
             and (window[2:4] != size or window[:2] == size)  # else only a part of its film is seen
         )
-        alone = len(plan.passes) == 1 and first.layers == {"image"} and first.places.size == 1
-        whole = plan.region == plan.seen == (0, 0, *size)
+        alone = len(plan.passes) == 1 and first.layers == {"image"} and first.pattern.size == 1
+        whole = plan.region == plan.padded_region == (0, 0, *size)
         traced = plan.kernel is not None and plan.variant == "llvm_ad_rgb"
         if not (plain and alone and whole and traced) or plan.layers or plan.motion:
             return
@@ -150,9 +150,9 @@ class Prepared:
         """The channels along one ray of each pixel."""
         exposer = self._exposer
         plan = self._made.plan
-        starts = exposer.starts(plan.passes[0].places, seed)
+        samples = exposer.samples(plan.passes[0].pattern, seed)
         pixel = dr.arange(mi.UInt32, plan.width * plan.height)
-        return exposer.trace(pixel, mi.UInt32(0), starts)[1]
+        return exposer.trace(pixel, mi.UInt32(0), samples)[1]
 
 
 def _window(film: mi.Film) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rendering.film import Places
+from mrt_mitsuba.rendering.film import SamplePattern
 from mrt_mitsuba.scene.report import report_scene
 
 SMALL = {"width": 96, "height": 72, "focaldist": 0}
@@ -31,7 +31,7 @@ def _shifted(number: int, way: tuple[float, ...]):
 
 def _times(aa: int = 4, repeats: int = 1, **shutter) -> np.ndarray:
     """Times of all rays, [64 pixels, rays of a pixel]."""
-    places = Places("report", aa, 0, aa**2, repeats, **shutter)
+    places = SamplePattern("report", aa, 0, aa**2, repeats, **shutter)
     pixel, ray = np.divmod(np.arange(64 * places.size, dtype=np.uint32), places.size)
     return np.array(places.at(mi.UInt32(pixel), mi.UInt32(ray), 8, 8)[1]).reshape(64, -1)
 
@@ -40,7 +40,7 @@ def _times(aa: int = 4, repeats: int = 1, **shutter) -> np.ndarray:
 @given(aa=st.integers(1, 9), repeats=st.integers(1, 5), seed=st.integers(0, 2**32 - 1))
 def test_every_ray_of_a_pixel_has_a_part_of_the_time_of_its_own(aa, repeats, seed):
     moments = aa**2 * repeats
-    times = _times(aa=aa, repeats=repeats, moments=moments, phase=None, seed=seed)
+    times = _times(aa=aa, repeats=repeats, time_strata=moments, phase=None, seed=seed)
     assert times.min() >= 0
     assert times.max() <= 1
     within = (times * moments % 1).mean(axis=1, keepdims=True)
@@ -51,14 +51,14 @@ def test_every_ray_of_a_pixel_has_a_part_of_the_time_of_its_own(aa, repeats, see
 @pytest.mark.parametrize("aa", [3, 4, 5, 8])
 def test_place_and_time_do_not_go_together(aa):
     """A moving edge needs all places at all times; in the order of the lattice, rows correlate by 0.97."""
-    times = _times(aa=aa, moments=aa**2, phase=0.5)[0]
+    times = _times(aa=aa, time_strata=aa**2, phase=0.5)[0]
     i, j = np.divmod(np.arange(aa**2), aa)
     for places in (i, j, i + j, i - j):
         assert abs(np.corrcoef(places, times)[0, 1]) < 0.35
 
 
 def test_pixels_have_other_times_than_their_neighbours_and_others_with_another_seed():
-    first, second = (_times(moments=16, phase=None, seed=seed) for seed in (1, 2))
+    first, second = (_times(time_strata=16, phase=None, seed=seed) for seed in (1, 2))
     assert len(np.unique(first[:, 0])) == 64
     assert (first != second).all()
     # the mean of 1024 stratified times: 1/16 / sqrt(12 * 64 pixels) = 0.0023 of deviation

@@ -37,12 +37,12 @@ def test_noise_under_a_filter_has_its_variance_and_correlation(rfilter):
     film = Film(look)
     inner = white_noise(look)[8:-8, 8:-8]
     # A variance of 57,600 values, each correlated with at most ten others, is known to 2 %
-    assert inner.var() * SPP == pytest.approx(film.averaging, rel=0.06)
+    assert inner.var() * SPP == pytest.approx(film.filter_variance_ratio, rel=0.06)
     power = np.abs(np.fft.fft2(inner / inner.std())) ** 2 / inner.size
     # Exponential at each frequency: the mean square is twice the square of the mean, the spectrum
     assert np.mean(power**2) / 2 == pytest.approx(film.correlation, rel=0.08)
     alike = np.ones((1, *film.shape))
-    assert_allclose(film.spread_out(alike), alike, rtol=1e-6)
+    assert_allclose(film.filtered_variance(alike), alike, rtol=1e-6)
 
 
 @pytest.mark.parametrize("region", [None, (3, 3, 4, 4)])

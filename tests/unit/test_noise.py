@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
+from inspect import getclosurevars
 from types import SimpleNamespace
 from typing import Any
 
@@ -39,13 +40,13 @@ class Draws:
         self.film = Film(mi.load_dict({"type": "perspective", "film": film}))
         self.draws = [draw_other or draw if picture == other else draw for picture in range(4)]
 
-    def expose(self, groups: Any, starts: Any, *, pictures: int, **_: Any) -> Any:
-        seed = starts.seed
+    def expose(self, groups: Any, samples: Any, *, pictures: int, **_: Any) -> Any:
+        seed = getclosurevars(samples).nonlocals["seed"]
         shape = (pictures, *self.film.shape)
         pixels = self.film.pixels
         rays = groups.rays_of(pictures * pixels).reshape(pictures, pixels)
         before = np.zeros((pictures, pixels), np.int64)
-        before.ravel()[groups.pixels] = groups.shares[1]
+        before.ravel()[groups.pixels] = groups.counts_and_first[1]
         total, square, peak = np.zeros((3, pictures, pixels))
         for picture, draw in enumerate(self.draws):
             rng = np.random.default_rng((seed, picture, int(before[picture].sum())))
@@ -58,7 +59,11 @@ class Draws:
         sums = total / np.maximum(rays, 1).reshape(shape)
         if self.film.reach:  # which averages noise, half of what changes within a pixel, too
             mean = sums.mean((-2, -1), keepdims=True)
-            sums = mean + (sums - mean) * (self.film.averaging * (1 + self.film.even) / 2) ** 0.5
+            sums = (
+                mean
+                + (sums - mean)
+                * (self.film.filter_variance_ratio * (1 + self.film.between_pixel_share) / 2) ** 0.5
+            )
         weights = (rays > 0).reshape(shape).astype(float)
         peak = peak.reshape(shape)
         return SimpleNamespace(sums=sums, weights=weights, rays=rays, total=total, square=square, peak=peak)

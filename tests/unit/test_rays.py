@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mrt_mitsuba.filters.grid import dilated, window_means
-from mrt_mitsuba.rendering.exposing import Groups
+from mrt_mitsuba.rendering.exposing import RayBatch
 from mrt_mitsuba.rendering.film import divide
 
 LARGEST = 2**32 - 1
@@ -68,9 +68,9 @@ def test_however_groups_are_cut_each_ray_is_traced_once(most):
     numbers = np.concatenate([b + np.arange(2 * n) for b, n in zip(before[0], counts[0], strict=True)])
     traced = []
     done = 0
-    for _, some in Groups.shared_out(2, counts, before).parts(most, 3):
+    for _, some in RayBatch.from_counts(2, counts, before).parts(lambda: most, 3):
         assert some.count <= most
-        assert some.before == done
+        assert some.first_group == done
         done += some.count
         traced.append(np.stack([np.array(lane) for lane in some.lanes()]))
     assert_array_equal(np.concatenate(traced, 1), [pixels, numbers])
