@@ -34,7 +34,7 @@ def made(kind: str) -> str:
 
 
 def test_a_file_is_registered_in_each_variant_and_once_in_each(variant, tmp_path):
-    (tmp_path / "numpy.py").write_text(SHINY.format(1, "shiny_file") + "open('log', 'a').close()")
+    (tmp_path / "numpy.py").write_text(SHINY.format(1, "shiny_file") + COUNT)
     numpy = sys.modules["numpy"]
     for _ in range(2):
         user_plugins.load("numpy.py")
