@@ -189,12 +189,19 @@ def _text(count: float) -> str:
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
 
 
+def affinity() -> list[int]:
+    """Return the numbers of the cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):  # neither macOS nor Windows
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
 def usable_cores(root: Path = Path("/")) -> int:
     """The cores of this process's affinity, or as many as its control groups grant if that is less.
 
     A quota of one and a half cores counts as two. ``root``: where the system's ``proc`` and ``sys`` are.
     """
-    counts = [len(os.sched_getaffinity(0))]
+    counts = [len(affinity())]
     for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):  # versions 2 and 1
         for texts in control_groups("cpu", names, root):
             with contextlib.suppress(ValueError):  # "max"

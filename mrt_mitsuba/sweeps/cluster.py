@@ -1,34 +1,39 @@
-"""Workers: processes of this machine, or of a cluster that somebody else has started; and jobs on them.
+"""Workers, on this machine or of a cluster that somebody else has started, and jobs on them.
 
 Needs Dask, which only a sweep does.
 """
 
 from __future__ import annotations
 
+import asyncio
+import json
 import logging
 import os
 import subprocess
+import sys
+import tempfile
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
+import dask
 from distributed import Client, Future, KilledWorker, Scheduler, SpecCluster, as_completed
 from distributed.client import ClosedClientError
 from distributed.deploy.subprocess import SubprocessWorker
+from distributed.security import Security
 from distributed.system import MEMORY_LIMIT
 
 from mrt_mitsuba.errors import MrtError, OutputError, one_line
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.sweeps import worker
-from mrt_mitsuba.sweeps.folder import Facts
-from mrt_mitsuba.sweeps.jobs import Job
+from mrt_mitsuba.sweeps.jobs import Facts, Job, encode
 
 CONNECTING = 10  # seconds to reach a scheduler, and for its first worker to be there
 STARTING = 120  # seconds for worker processes of this machine; a busy one takes its time
-DIED = "every worker that rendered it died, perhaps for want of memory: give each more"
-MOST_DEATHS = 10  # of workers that had been given a job which they did not begin
+DIED = "every worker that rendered it died, perhaps for lack of memory: give each more"
+LOOPBACK = "127.0.0.1"
 
 
 class ClusterError(MrtError):
@@ -41,28 +46,31 @@ def connected(
 ) -> Iterator[Client]:
     """Give a client whose workers are there; see ``sweep``.
 
-    Workers of this machine, as many as there are jobs at most, end with the block. Raises ``ClusterError``
-    where no scheduler answers or has a worker, and where it goes away in the block.
+    Workers of this machine, at most as many as jobs, end with the block. Raises ``ClusterError`` if no
+    scheduler with a worker answers, or if it goes away in the block.
     """
     with ExitStack() as stack:
-        # Whoever asked for connections that break says so once
+        # Dask logs each broken connection; the caller gets one error
         for name in ("distributed", "distributed.client", "tornado.application"):
             logger = logging.getLogger(name)
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL)
         count = 1
         patience = CONNECTING
+        security = None
         if cluster is None:
             devices = gpus() if variant.startswith("cuda") else []
             count = workers or min(len(devices) or usable_cores(), jobs)
             patience = STARTING
-            cluster = stack.enter_context(_local(count, dashboard, devices))
+            security = Security.temporary()
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="mrt-sweep-"))
+            cluster = stack.enter_context(_local(count, dashboard, devices, security, folder))
         try:
             client = cluster
             if not isinstance(cluster, Client):
                 client = Client.__new__(Client)
                 stack.callback(_close, client)
-                Client.__init__(client, cluster, timeout=CONNECTING, set_as_default=False)
+                Client.__init__(client, cluster, timeout=CONNECTING, set_as_default=False, security=security)
             client.wait_for_workers(count, timeout=patience)
         except Exception as error:  # whatever the engine makes of an address, or of a client that is closed
             raise ClusterError(
@@ -78,39 +86,77 @@ def connected(
 
 
 def _close(client: Client) -> None:
-    """Close a client, also one that could not connect: if the garbage collector does while Dask holds a lock,
-    it waits for ever."""
+    """Close a client, also one that could not connect: closed by the garbage collector while Dask holds a
+    lock, it deadlocks."""
     with suppress(Exception):
         client.close()
 
 
-def _local(count: int, dashboard: int | None, devices: list[str]) -> Any:
-    """A scheduler in this process, and workers in processes of their own with one thread for jobs.
-    They do not import the caller's script, so it needs no ``if __name__ == "__main__"``."""
+class LocalWorker(SubprocessWorker):
+    """A worker process of this machine.
+
+    It does not import the caller's script, which needs no ``if __name__ == "__main__"``. ``python -m dask``
+    puts its working folder first in ``sys.path``, so it starts in a private one, ``folder``.
+    """
+
+    def __init__(self, *args: Any, folder: str, environ: dict[str, str], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.folder = folder
+        self.environ = environ
+
+    async def _start(self) -> None:
+        spec = json.dumps({"cls": self.worker_class, "opts": self.worker_kwargs})
+        command = [sys.executable, "-m", "dask", "spec", self.scheduler, "--spec", spec]
+        environ = os.environ | self.environ
+        self.process = await asyncio.create_subprocess_exec(*command, cwd=self.folder, env=environ)
+
+
+def _local(
+    count: int, dashboard: int | None, devices: list[str], security: Security, folder: str
+) -> SpecCluster:
+    """Return a scheduler in this process, and workers in processes of their own with one thread for jobs.
+
+    All listen on the loopback only, and talk TLS with a key made for this sweep, as other users of this
+    machine can reach the loopback, too. The environment hands workers the key: other users see their command
+    lines, but not that.
+    """
     options = {
         "nthreads": 1,
         "memory_limit": MEMORY_LIMIT // count,
+        "host": LOOPBACK,
         "dashboard": False,
+        "dashboard_address": f"{LOOPBACK}:0",
+        "local_directory": folder,
         "silence_logs": logging.CRITICAL,
         "config": {"distributed.worker.profile.enabled": False},  # it stops a job 100 times a second
     }
-    kernels = {"DRJIT_CACHE_DIR": os.environ.get("DRJIT_CACHE_DIR", os.path.expanduser("~/.drjit"))}
-    environs = [kernels | {"CUDA_VISIBLE_DEVICES": device} for device in devices] or [kernels]
+    tls = {"CA_FILE": security.tls_ca_file}
+    tls |= {"WORKER__KEY": security.tls_worker_key, "WORKER__CERT": security.tls_worker_cert}
+    environ = {f"DASK_DISTRIBUTED__COMM__TLS__{name}": value for name, value in tls.items()}
+    environ["DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION"] = "True"
+    environs = [environ | {"CUDA_VISIBLE_DEVICES": device} for device in devices] or [environ]
     workers = {}
     for number in range(count):
-        own = options | {"env": environs[number % len(environs)]}
-        workers[number] = {"cls": SubprocessWorker, "options": {"worker_kwargs": own}}
+        own = {"worker_kwargs": options, "folder": folder, "environ": environs[number % len(environs)]}
+        workers[number] = {"cls": LocalWorker, "options": own}
     scheduler = {
-        "allowed_failures": 0,  # ``outcomes`` hands over again a job that lost its worker
-        "host": "127.0.0.1",
+        "allowed_failures": 0,  # ``outcomes`` submits a job again that lost its worker
+        "host": LOOPBACK,
+        "protocol": "tls",
+        "security": security,
         "dashboard": dashboard is not None,
-        "dashboard_address": f":{dashboard or 0}",
+        "dashboard_address": f"{LOOPBACK}:{dashboard or 0}",
     }
-    return SpecCluster(workers=workers, scheduler={"cls": Scheduler, "options": scheduler})
+    with dask.config.set(
+        {"distributed.scheduler.worker-saturation": 1.0}
+    ):  # none waits on a worker that dies
+        return SpecCluster(
+            workers=workers, scheduler={"cls": Scheduler, "options": scheduler}, security=security
+        )
 
 
 def gpus() -> list[str]:
-    """The GPUs this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
+    """Return the GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     if named is None:
         with suppress(OSError, subprocess.SubprocessError):
@@ -119,21 +165,21 @@ def gpus() -> list[str]:
     return [name for name in (named or "").split(",") if name]
 
 
-def inspect(client: Client, scratch: str, here: str) -> dict[str, int]:
-    """The number of workers that share each set of cores, see ``render_job``.
+def inspect(client: Client, folder: str, here: str) -> dict[str, int]:
+    """Return the number of workers that share each set of cores, see ``render_job``.
 
-    Raises ``ClusterError`` or ``OutputError`` where one has other versions than those ``here`` or cannot be
-    used.
+    Raises ``ClusterError`` or ``OutputError`` if a worker has other versions than those ``here`` or cannot
+    write to the folder.
     """
     try:
-        workers = client.run(worker.describe, scratch)
+        workers = client.run(worker.describe, folder)
     except Exception as error:  # whatever another Python or another version makes of it
         raise ClusterError(
             f"the workers cannot run this mrt-mitsuba ({type(error).__name__}: {error}): install {here} there"
         ) from error
     for name, facts in workers.items():
         if not facts["sees"]:
-            raise OutputError(f"the worker {name} cannot write to {scratch}: choose a folder that all share")
+            raise OutputError(f"the worker {name} cannot write to {folder}: choose a folder that all share")
         if facts["versions"] != here:
             raise ClusterError(
                 f"the worker {name} has {facts['versions']} and this process {here}: install the same "
@@ -143,44 +189,42 @@ def inspect(client: Client, scratch: str, here: str) -> dict[str, int]:
 
 
 def outcomes(
-    client: Client, jobs: Sequence[Job], retries: int, scratch: str, **setting: Any
+    client: Client, jobs: Sequence[Job], retries: int, **setting: Any
 ) -> Generator[tuple[Job, Facts], None, None]:
     """Let workers render jobs, and yield each as it ends, with its facts or its "error".
 
-    One that lost its worker, or failed by accident, is handed over again. ``setting``: of ``render_job``.
+    A job that lost its worker or failed unexpectedly is submitted again, ``retries`` times at most.
+    ``setting``: arguments of ``render_job``.
     """
-    calls: dict[Future, Job] = {}
-    handed: Counter[str] = Counter()
+    submitted: dict[Future, Job] = {}
+    attempts: Counter[str] = Counter()
     coming = as_completed(loop=client.loop)
 
-    def hand_over(job: Job) -> None:
-        handed[job.name] += 1
-        key = f"{os.path.basename(scratch)} {job.name} {handed[job.name]}"
-        future = client.submit(worker.render_job, job, scratch=scratch, **setting, key=key, pure=False)
-        calls[future] = job
+    def submit(job: Job) -> None:
+        attempts[job.name] += 1
+        future = client.submit(worker.render_job, encode(job), **setting, pure=False)
+        submitted[future] = job
         coming.add(future)
 
     try:
         for job in jobs:
-            hand_over(job)
+            submit(job)
         for future in coming:
-            job = calls.pop(future)
-            if future.status == "cancelled":  # as all are where the scheduler goes; "lost": with its worker
+            job = submitted.pop(future)
+            if future.status == "cancelled":  # as all are where the scheduler goes
                 raise CancelledError
-            facts = worker.outcome(job, scratch)
-            ended = "error" in facts or "file" in facts
-            # The engine holds a worker's death against all jobs that the worker had been given
-            if facts.pop("again", not ended) and (
-                facts["attempts"] <= retries and handed[job.name] < retries + MOST_DEATHS
-            ):
-                hand_over(job)
-                continue
-            if not ended:
-                error = future.exception() if future.status == "error" else None
-                died = error is None or isinstance(error, KilledWorker)
+            facts = {"attempts": attempts[job.name]}
+            try:
+                facts |= future.result()
+            except CancelledError:
+                raise
+            except Exception as error:  # of the job, or its worker died
+                if attempts[job.name] <= retries:
+                    submit(job)
+                    continue
+                died = isinstance(error, KilledWorker)
                 facts["error"] = DIED if died else one_line(f"{type(error).__name__}: {error}")
-            future.release()  # what no one needs is not computed again when its worker goes
             yield job, facts
     finally:
         if client.status == "running":
-            client.cancel(list(calls))
+            client.cancel(list(submitted))

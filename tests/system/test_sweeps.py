@@ -8,6 +8,7 @@ import itertools
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from multiprocessing.pool import ThreadPool
@@ -177,33 +178,14 @@ def test_pictures_of_another_version_are_made_again(address, tmp_path, monkeypat
         runtime.versions.cache_clear()
 
 
-def test_a_picture_that_was_cut_is_made_again(address, tmp_path, monkeypatch, capfd):
-    """At every kilobyte: the sweep comes so far as to look for workers."""
-    options: dict[str, Any] = {"grid": {"seed": [1]}, "png": True, "width": 32, "height": 16, "aa": 1}
-    mrt.sweep(3, tmp_path, cluster=address, **options)
-    monkeypatch.setattr("mrt_mitsuba.sweeps.cluster.CONNECTING", 0.2)
-    assert not mrt.sweep(3, tmp_path, cluster=NOWHERE, **options).failed  # whole, and none is needed
-    for file in (tmp_path / "seed=1.exr", tmp_path / "seed=1.png"):
-        whole = file.read_bytes()
-        for length in range(0, len(whole), 1024):
-            file.write_bytes(whole[:length])
-            with pytest.raises(MrtError, match="no scheduler with workers answers"):
-                mrt.sweep(3, tmp_path, cluster=NOWHERE, **options)
-        file.write_bytes(whole)
-    assert capfd.readouterr() == ("", "")  # nothing of what libraries print about broken files
-
-
 @pytest.mark.parametrize(
     "name",
-    ["table.csv", "table.csv/", "seed=1.exr", "seed=1.png", "link", "own.png", "picture.tiles/0,0.exr"],
+    ["table.csv", "table.csv/", "seed=1.exr", "seed=1.png", "link", "own.png"],
 )
 def test_a_file_of_the_users_own_is_refused_by_name(address, tmp_path, name):
     stands_for = {"link": "seed=1.exr", "own.png": "seed=1.png"}
     mine = tmp_path / stands_for.get(name, name)
-    mine.parent.mkdir(exist_ok=True)
     options: dict[str, Any] = {"grid": {"seed": [1]}, "png": True}
-    if "tiles" in name:
-        options = {"tiles": (1, 2)}
     if name == "own.png":  # next to a picture that a sweep made
         mrt.sweep(3, tmp_path, grid={"seed": [1]}, cluster=address, **SMALL)
     if name == "link":
@@ -291,17 +273,13 @@ wrong_grid("scene is given twice", {"scene": [1]}, scene=3)
 wrong_grid("99", {"scene": [99]}, scene=None)
 wrong_grid("cannot read none.xml", {"scene": ["none.xml"]}, scene=None)
 wrong_grid("zipped axes must be of one length", {"aa": [1, 2], "seed": [1]}, zipped=True)
-wrong_grid("cannot be sent to others", {"integrator": [lambda: 0]})
-wrong_grid("tiles: target and aamode=noise", {"target": [0.1]}, tiles=(2, 2))
 
 wrong_options("cannot make the folder", out="a\0b")
 wrong_options("cannot make the folder", out=__file__ + "/out")
-wrong_options("give the scene as a number, a dict or a path", scene={"type": lambda: 0})
+wrong_options("give the scene as a number, a dict or a path", scene={"type": threading.Lock()})
 wrong_options("'progres' is not an option of render: did you mean progress", progres=1)
 wrong_options("width=0: must be", width=0)
-wrong_options("leave out png", tiles=(2, 2), png=True)
-for tiles in ((0, 1), (2,), 3, (2.0, 2), (49, 1)):
-    wrong_options("tiles=", tiles=tiles, **SMALL)
+wrong_options("plugins=none.py: no such Python file", plugins="none.py")
 wrong_options("workers=0: must be a whole number", workers=0)
 wrong_options("give one of them", workers=2, cluster=NOWHERE)
 wrong_options("retries=-1", retries=-1)
@@ -318,10 +296,9 @@ def test_a_broken_grid_is_refused_before_anything_is_rendered(tmp_path, monkeypa
 
 
 # What each worker runs first: seed 1 fails, 2 costs the first worker that takes it, 3 every worker, and 4
-# takes more memory than there is; workers die with what they would report of 1 and 5, and have reported of 6
+# takes more memory than there is
 SPOILED = """
-import os, pathlib, threading, time
-from distributed.batched import BatchedSend
+import os, pathlib, time
 from mrt_mitsuba.rendering import api
 def render(*scene, seed=0, alone=api.render, **options):
     if seed == 1:
@@ -334,42 +311,24 @@ def render(*scene, seed=0, alone=api.render, **options):
         kept = [b"x" * 10**8 for _ in range(13)]
         time.sleep(60)
     return alone(*scene, seed=seed, **options)
-def send(self, *messages, alone=BatchedSend.send):
-    for message in messages:
-        ended = message.get("op") in ("task-finished", "task-erred")
-        if ended and message["key"].split()[1] in ("seed=1", "seed=5"):
-            os._exit(1)
-        if ended and message["key"].split()[1] == "seed=6":  # a moment after it was reported
-            threading.Timer(0.05, os._exit, [1]).start()
-    alone(self, *messages)
-api.render, BatchedSend.send = render, send
+api.render = render
 """
-
-
-class Slow(Progress):
-    """Looks at each outcome so late that its worker may have died since."""
-
-    @contextlib.contextmanager
-    def stage(self, *words: Any) -> Iterator[Callable[[int], None]]:
-        yield lambda steps: time.sleep(0.2)
 
 
 def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path):
     out = tmp_path / "out"
     cluster = mortal(SPOILED, "--memory-limit", "1200MB")
-    options = {"cluster": cluster.address, "retries": 1, "progress": Slow(), **SMALL}
-    table = mrt.sweep(3, out, grid={"seed": range(10)}, **options)
+    table = mrt.sweep(3, out, grid={"seed": range(8)}, cluster=cluster.address, retries=1, **SMALL)
     errors = {row["seed"]: row["error"] for row in table.failed}
     assert errors.keys() == {1, 3, 4}
     assert errors[1] == "RuntimeError: out of luck"
     assert errors[3] == errors[4]
-    assert "every worker that rendered it died, perhaps for want of" in errors[3]
+    assert "every worker that rendered it died, perhaps for lack of" in errors[3]
     attempts = [row["attempts"] for row in table.rows]
-    assert attempts[1] == 2 <= attempts[2]
-    assert attempts[5] == 1
-    assert len(made(out)) == 7
+    assert attempts[1] == attempts[2] == attempts[3] == 2
+    assert len(made(out)) == 5
     assert not left_over(out)
-    assert str(table).startswith("7 of 10 pictures")
+    assert str(table).startswith("5 of 8 pictures")
     assert all(row["file"] == "" for row in table.failed)
 
 
@@ -497,76 +456,8 @@ def test_a_gpu_is_pinned_to_each_worker(tmp_path, monkeypatch):
     assert sorted(found.values()) == ["5", "GPU-7"]
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"aa": 3, "focaldist": 2.0, "focalrange": 0.5, "layers": ["normal", "blur"]},
-        {"aa": 2, "aamode": "luma", "integrator": "path", "spp": 2, "seed": 3},
-    ],
-    ids=["filters", "random numbers"],
-)
-def test_tiles_make_the_same_picture(address, tmp_path, options):
-    size = {"width": 231, "height": 173}
-    mrt.render(3, **size, **options).save(tmp_path / "whole.exr")
-    table = mrt.sweep(3, tmp_path / "out", tiles=(3, 4), cluster=address, **size, **options)
-    assert [row["error"] for row in table.rows] == [""]
-    assert table.rows[0]["rays"] > 231 * 173
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["picture.exr", "table.csv"]
-    whole = read_exr(tmp_path / "whole.exr")
-    tiled = read_exr(tmp_path / "out" / "picture.exr")
-    assert tiled.image.tobytes() == whole.image.tobytes()
-    for name, values in (tiled.layers | whole.layers).items():
-        assert tiled.layers[name].tobytes() == whole.layers[name].tobytes() == values.tobytes(), name
-    for header in (whole.header, tiled.header):
-        header.pop("mrt:sweep", None)
-    assert {key: str(x) for key, x in tiled.header.items()} == {
-        key: str(x) for key, x in whole.header.items()
-    }
-
-
-def test_tiles_keep_to_the_memory_that_was_granted(address, tmp_path):
-    size = {"width": 4096, "height": 4096, "aa": 1}
-    (row,) = mrt.sweep(3, tmp_path, tiles=(1, 2), cluster=address, memory="64M", **size).failed
-    assert "of memory, and 64 MiB may be" in row["error"]
-
-
 def test_the_command_says_that_a_job_failed(address, tmp_path, capsys):
     lines = ["scene = 3", "width = 4096", "height = 4096", "aa = 1", 'memory = "64M"']
     (tmp_path / "sweep.toml").write_text("\n".join(lines))
     assert cli.main(["sweep", str(tmp_path / "out"), str(tmp_path / "sweep.toml"), f"cluster={address}"]) == 1
     assert "failed: " in capsys.readouterr().out
-
-
-# What each worker runs first: it notes the tiles that it renders, and fails below the first row until allowed
-BROKEN = """
-import pathlib
-from mrt_mitsuba.rendering import api
-def render(*scene, region, alone=api.render, **options):
-    if region[1] > 0 and not pathlib.Path("allowed").exists():
-        raise RuntimeError("out of luck")
-    with open("rendered", "a") as file:
-        print(region, file=file)
-    return alone(*scene, region=region, **options)
-if api.render.__module__ == api.__name__:  # it is read more than once
-    api.render = render
-"""
-
-
-def test_tiles_of_an_earlier_sweep_are_kept(mortal, tmp_path):
-    """Those that are whole, unless asked otherwise: of two that are there, one was cut in the meantime."""
-    address = mortal(BROKEN).address
-    out = tmp_path / "out"
-    first = mrt.sweep(3, out, tiles=(2, 2), retries=0, cluster=address, **SMALL)
-    assert "out of luck" in first.failed[0]["error"]
-    mrt.sweep(3, out, tiles=(2, 2), retries=0, resume=False, cluster=address, **SMALL)
-    tile, cut = (out / "picture.tiles" / f"0,{column}.exr" for column in (0, 1))
-    assert tile.exists()
-    cut.write_bytes(cut.read_bytes()[:9000])
-    (tmp_path / "cluster0" / "allowed").touch()
-    second = mrt.sweep(3, out, tiles=(2, 2), cluster=address, **SMALL)
-    assert not second.failed
-    assert second.rows[0]["rays"] is None  # unknown of the tile that was there
-    rendered = (tmp_path / "cluster0" / "rendered").read_text().splitlines()
-    assert sorted(map(rendered.count, rendered)) == [1, 1, 2, 2, 3, 3, 3]
-    assert read_exr(out / "picture.exr").image.tobytes() == mrt.render(3, **SMALL).image.tobytes()
-    assert not (out / "picture.tiles").exists()

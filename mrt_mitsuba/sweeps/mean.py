@@ -1,0 +1,90 @@
+"""The mean of renders with different seeds, and its error."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+
+import numpy as np
+
+from mrt_mitsuba import runtime
+from mrt_mitsuba.adaptive.error import ErrorEstimate
+from mrt_mitsuba.files.images import read_exr
+from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS
+from mrt_mitsuba.machine import Budget
+from mrt_mitsuba.rendering.api import Result, open_with
+from mrt_mitsuba.rendering.plan import make_plan
+from mrt_mitsuba.rendering.progress import Timings
+from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.shading import Shader, camera_matrices
+from mrt_mitsuba.scene.open import sized
+from mrt_mitsuba.sweeps.jobs import Facts, Job
+
+BLOCK = 8  # pixels along the side of a block whose noise is taken as independent of other blocks'
+
+
+def mean_of_seeds(folder: str, job: Job, rows: Sequence[Facts]) -> Result:
+    """Return the mean of the pictures in ``rows``; ``job``: one of theirs, for the plan and the camera."""
+    total: np.ndarray | None = None
+    square = np.zeros(())
+    layers: dict[str, np.ndarray] = {}
+    for row in rows:
+        picture = read_exr(os.path.join(folder, row["file"]))
+        if total is None:
+            first = picture.image.astype(np.float64)
+            total = np.zeros_like(first)
+            square = np.zeros_like(first)
+            layers = {name: np.zeros_like(values) for name, values in picture.layers.items()}
+        shifted = picture.image - first  # around the first: no digits cancel
+        total += shifted
+        square += shifted * shifted
+        for name, values in picture.layers.items():
+            source = getattr(LAYERS.get(name.split(".")[0]), "source", "")
+            if name == "samples.Y":
+                layers[name] += values
+            elif source in (FIRST_HIT, DERIVED):
+                layers[name] = values
+            else:
+                layers[name] += values / np.float32(len(rows))
+    assert total is not None
+    count = len(rows)
+    variance = np.maximum(square - total * total / count, 0) / (count - 1) / count  # of the mean
+    layers.pop("variance", None)
+    layers["error.Y"] = np.sqrt(variance.mean(-1)).astype(np.float32)
+    settings = RenderSettings.of(**job.arguments)
+    with runtime.one_at_a_time.lock, runtime.within(settings.variant or runtime.use()):
+        source = open_with(job.scene, settings, Budget.of(None))
+        with sized(source):
+            plan = make_plan(source, Shader(source, settings.motion), settings)
+            camera = camera_matrices(source.sensor)
+    return Result(
+        image=(first + total / count).astype(np.float32),
+        layers=layers,
+        plan=plan,
+        timings=Timings(total=sum(row["seconds"] or 0.0 for row in rows)),
+        rays={"all": sum(row["rays"] or 0 for row in rows)},
+        kernel_launches=0,
+        options={**plan.options, "seed": [row["seed"] for row in rows]},
+        versions=runtime.versions(),
+        camera=camera,
+        error=_estimate(variance),
+    )
+
+
+def _estimate(variance: np.ndarray) -> ErrorEstimate:
+    """Return the error of a mean from the variance of its pixels, [H, W, 3].
+
+    The interval is that of a mean of blocks, within which a reconstruction filter correlates pixels.
+    """
+    blocks = variance.mean(-1)
+    for axis in (0, 1):
+        steps = np.arange(0, blocks.shape[axis], BLOCK)
+        sizes = np.diff(np.append(steps, blocks.shape[axis]))
+        sums = np.add.reduceat(blocks, steps, axis=axis)
+        blocks = sums / np.expand_dims(sizes, 1 - axis)
+    mean = float(variance.mean())
+    doubt = 1.96 * float(blocks.std()) / math.sqrt(blocks.size)
+    return ErrorEstimate(
+        rmse=math.sqrt(mean), low=math.sqrt(max(mean - doubt, 0.0)), high=math.sqrt(mean + doubt)
+    )
