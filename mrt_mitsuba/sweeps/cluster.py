@@ -12,13 +12,13 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
-import dask
+import cryptography  # noqa: F401 - which Dask imports when it makes a key
 from distributed import Client, Future, KilledWorker, Scheduler, SpecCluster, as_completed
 from distributed.client import ClosedClientError
 from distributed.deploy.subprocess import SubprocessWorker
@@ -147,12 +147,7 @@ def _local(
         "dashboard": dashboard is not None,
         "dashboard_address": f"{LOOPBACK}:{dashboard or 0}",
     }
-    with dask.config.set(
-        {"distributed.scheduler.worker-saturation": 1.0}
-    ):  # none waits on a worker that dies
-        return SpecCluster(
-            workers=workers, scheduler={"cls": Scheduler, "options": scheduler}, security=security
-        )
+    return SpecCluster(workers=workers, scheduler={"cls": Scheduler, "options": scheduler}, security=security)
 
 
 def gpus() -> list[str]:
@@ -196,35 +191,39 @@ def outcomes(
     A job that lost its worker or failed unexpectedly is submitted again, ``retries`` times at most.
     ``setting``: arguments of ``render_job``.
     """
+    waiting = deque(jobs)
     submitted: dict[Future, Job] = {}
     attempts: Counter[str] = Counter()
     coming = as_completed(loop=client.loop)
 
-    def submit(job: Job) -> None:
-        attempts[job.name] += 1
-        future = client.submit(worker.render_job, encode(job), **setting, pure=False)
-        submitted[future] = job
-        coming.add(future)
+    def submit() -> None:  # no more than run at once: a worker that dies takes along what it was given
+        while waiting and len(submitted) < max(1, sum(client.nthreads().values())):
+            job = waiting.popleft()
+            attempts[job.name] += 1
+            future = client.submit(worker.render_job, encode(job), **setting, pure=False)
+            submitted[future] = job
+            coming.add(future)
 
     try:
-        for job in jobs:
-            submit(job)
+        submit()
         for future in coming:
             job = submitted.pop(future)
             if future.status == "cancelled":  # as all are where the scheduler goes
                 raise CancelledError
-            facts = {"attempts": attempts[job.name]}
+            facts: Facts = {"attempts": attempts[job.name]}
             try:
                 facts |= future.result()
             except CancelledError:
                 raise
             except Exception as error:  # of the job, or its worker died
-                if attempts[job.name] <= retries:
-                    submit(job)
-                    continue
                 died = isinstance(error, KilledWorker)
                 facts["error"] = DIED if died else one_line(f"{type(error).__name__}: {error}")
-            yield job, facts
+                if attempts[job.name] <= retries:
+                    waiting.append(job)
+                    facts = {}
+            submit()
+            if facts:
+                yield job, facts
     finally:
         if client.status == "running":
             client.cancel(list(submitted))

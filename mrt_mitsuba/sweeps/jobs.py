@@ -12,7 +12,7 @@ import re
 from collections import ChainMap, Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, SupportsIndex
+from typing import Any, ClassVar, NamedTuple, SupportsIndex
 
 import drjit as dr
 import mitsuba as mi
@@ -168,8 +168,10 @@ def _sendable(scene: Any) -> Any:
 
 
 def check_parameters(jobs: Sequence[Job]) -> None:
-    """Raise ``UsageError`` if a job sets what its scene does not have; loads each scene once for values of the
-    same types."""
+    """Raise ``UsageError`` if a job sets what its scene does not have.
+
+    Loads each scene once for values of the same types.
+    """
     opened = set()
     for job in jobs:
         params = job.arguments.get("params") or {}
@@ -206,12 +208,15 @@ def encode(value: object) -> bytes:
     """
     import cloudpickle
 
+    transforms = [getattr(mi, name) for name in dir(mi) if name.endswith("Transform4f")]
+    own = {**dict.fromkeys(transforms, _transform_parts), mi.Bitmap: _bitmap_parts}
+
+    class Pickler(cloudpickle.Pickler):
+        dispatch_table: ClassVar[Any] = ChainMap(own, cloudpickle.Pickler.dispatch_table)
+
     stream = io.BytesIO()
-    pickler = cloudpickle.Pickler(stream, protocol=5)
+    pickler = Pickler(stream, protocol=5)
     pickler.fast = True  # no references to what came before: they would distinguish equal from identical
-    own = {getattr(mi, name): _transform_parts for name in dir(mi) if name.endswith("Transform4f")}
-    own[mi.Bitmap] = _bitmap_parts
-    pickler.dispatch_table = ChainMap(own, pickler.dispatch_table)
     try:
         pickler.dump(value)
     except (TypeError, AttributeError, pickle.PicklingError, RecursionError) as error:

@@ -98,7 +98,7 @@ def test_a_killed_sweep_frees_the_folder_and_its_pictures_are_kept(tmp_path, mon
     out = tmp_path / "out"
     with start(*COMMAND, "sweep", "out", "sweep.toml", "workers=1") as process:
         deadline = time.monotonic() + PATIENCE
-        while not len(list(out.glob("*.exr"))) == 2:  # the third picture has been begun
+        while len(list(out.glob("*.exr"))) != 2:  # the third picture has been begun
             assert time.monotonic() < deadline
             time.sleep(0.05)
         process.send_signal(signal.SIGKILL)
