@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mrt_mitsuba.adaptive.error import exceedance
+from mrt_mitsuba.adaptive.tails import exceedance
 from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
 from mrt_mitsuba.files.images import read_channels, write_exr, write_png
 from mrt_mitsuba.files.replacing import check_target

@@ -10,17 +10,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.adaptive.target import Goal, StatesGoal, Target
+from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
+from mrt_mitsuba.adaptive.target import AdaptiveIntegrator, Goal, Target
 from mrt_mitsuba.errors import warn
 from mrt_mitsuba.plugins.parameters import ParameterError, integer, number
 from mrt_mitsuba.plugins.variants import construct_quietly, text_of
 from mrt_mitsuba.rendering.settings import MAX_SPP
 
-PARAMETERS = ("target", "max_spp", "max_seconds", "spp")
-FEWEST = 8  # rays of a pixel in the first round
+PARAMETERS = ("target", "metric", "max_spp", "max_seconds", "spp")
+MIN_SPP = 8  # rays of a pixel in the first round
 
 
-@StatesGoal.register
+@AdaptiveIntegrator.register
 class MrtAdaptive(mi.SamplingIntegrator):
     r"""Renders to an error with another integrator: rays go in rounds to the pixels that need them.
 
@@ -33,8 +34,10 @@ class MrtAdaptive(mi.SamplingIntegrator):
     ================ =========== ======== ================================================================
     name             type        default  unit or range
     ================ =========== ======== ================================================================
-    ``target``       float or    0.01     > 0, RMSE to the converged picture, in linear values; "2%": of the
-                     string               mean luminance of the picture
+    ``target``       float or    0.01     > 0, RMSE to the converged picture; "2%": of its mean luminance or,
+                     string               with another metric, of 1
+    ``metric``       string      linear   "linear", "relative" or "display": RMSE of linear values, relative
+                                          to them, or of sRGB values clipped to [0, 1]
     ``max_spp``      integer     4096     >= 8, rays of a pixel at most, on average
     ``max_seconds``  float       0        >= 0, time to spend at most; 0 for no limit
     ``spp``          integer     (none)   >= 8, in place of ``target``: a mean of so many rays a pixel
@@ -68,6 +71,11 @@ class MrtAdaptive(mi.SamplingIntegrator):
             raise ParameterError(f'mrt_adaptive: "{others[0]}" is none of its parameters: {known}')
         if len(inner) != 1 or isinstance(inner[0], MrtAdaptive):
             raise ParameterError("mrt_adaptive: give one integrator inside, such as path")
+        if not isinstance(inner[0], mi.SamplingIntegrator):
+            raise ParameterError(
+                f"mrt_adaptive: {inner[0].class_name()} gives whole pictures, not single rays; nest another, "
+                "such as path"
+            )
         self.nested = inner[0]
         self.goal = _goal(props)
 
@@ -75,8 +83,8 @@ class MrtAdaptive(mi.SamplingIntegrator):
         """The goal with a bound of ``spp`` rays a pixel on average, as ``mi.render`` gives it; 0: none."""
         if not spp:
             return self.goal
-        most = spp if self.goal.target is None else min(self.goal.most, spp)
-        return replace(self.goal, most=max(most, FEWEST))
+        most = spp if self.goal.target is None else min(self.goal.max_spp, spp)
+        return replace(self.goal, max_spp=max(most, MIN_SPP))
 
     def render(
         self,
@@ -92,8 +100,8 @@ class MrtAdaptive(mi.SamplingIntegrator):
         from mrt_mitsuba.rendering.settings import RenderSettings
         from mrt_mitsuba.scene.open import opened
 
-        if 0 < spp < FEWEST:
-            warn(f"mrt_adaptive takes {FEWEST} rays a pixel at least, not spp={spp}")
+        if 0 < spp < MIN_SPP:
+            warn(f"mrt_adaptive takes {MIN_SPP} rays a pixel at least, not spp={spp}")
         number = sensor if isinstance(sensor, int) else 0
         view = _sensor(scene, sensor)
         seed = int(np.ravel(seed)[0]) % 2**32
@@ -136,7 +144,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         """
         if self.nested.class_name() != "AOVIntegrator" or not names:
             return picture
-        from mrt_mitsuba.adaptive.noise import LUMINANCE
+        from mrt_mitsuba.adaptive.estimate import LUMINANCE
 
         film, further = np.split(np.array(picture), [picture.shape[2] - len(names)], axis=2)
         shown = list[np.ndarray]()
@@ -173,19 +181,24 @@ class MrtAdaptive(mi.SamplingIntegrator):
 
     def to_string(self) -> str:
         goal = self.goal
-        aim = f"spp={goal.most}" if goal.target is None else f"target={goal.target}, max_spp={goal.most}"
-        return f"MrtAdaptive[{aim}, max_seconds={goal.seconds or 0:g}, nested={text_of(self.nested)}]"
+        aim = (
+            f"spp={goal.max_spp}" if goal.target is None else f"target={goal.target}, max_spp={goal.max_spp}"
+        )
+        return f"MrtAdaptive[{aim}, max_seconds={goal.max_seconds or 0:g}, nested={text_of(self.nested)}]"
 
 
 def _goal(props: mi.Properties) -> Goal:
     """The goal that the parameters state; raise ``ParameterError`` for values that are not allowed."""
     if "spp" in props and "target" in props:
         raise ParameterError('mrt_adaptive: give "target" or "spp", not both')
+    metric = props.get("metric", LINEAR.name)
+    if metric not in METRICS:
+        raise ParameterError(f'mrt_adaptive: "metric" is {metric!r}, but must be one of {", ".join(METRICS)}')
     seconds = number(props, "max_seconds", 0.0, least=0) or None
-    most = integer(props, "max_spp", MAX_SPP, least=FEWEST, most=2**24)
+    most = integer(props, "max_spp", MAX_SPP, least=MIN_SPP, most=2**24)
     if "spp" in props:
-        return Goal(None, integer(props, "spp", most, least=FEWEST, most=65536), seconds)
-    return Goal(_target(props), most, seconds)
+        return Goal(None, integer(props, "spp", most, least=MIN_SPP, most=65536), seconds, metric)
+    return Goal(_target(props), most, seconds, metric)
 
 
 def _target(props: mi.Properties) -> Target:

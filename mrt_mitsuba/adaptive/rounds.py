@@ -7,163 +7,272 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
+import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.adaptive.error import DOUBTFUL, ErrorEstimate, Round, RoundPicture
-from mrt_mitsuba.adaptive.noise import estimate
+from mrt_mitsuba.adaptive.allocate import HEAVY_TAIL_SHAPE, Allocator
+from mrt_mitsuba.adaptive.error import ErrorEstimate, Round, RoundPicture
+from mrt_mitsuba.adaptive.estimate import (
+    Blurred,
+    Forecast,
+    SampleStatistics,
+    estimate_error,
+    forecast,
+    pixel_error,
+    pixel_variance,
+)
+from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
+from mrt_mitsuba.adaptive.tails import PARETO_K_THRESHOLD
 from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import warn
+from mrt_mitsuba.plugins import plugin
+from mrt_mitsuba.rendering.exposing import Exposer, RayBatch, film_samples
 from mrt_mitsuba.rendering.progress import Advance
-
-if TYPE_CHECKING:
-    from mrt_mitsuba.adaptive.noise import Forecast, Noise, State
 
 log = logging.getLogger(__name__)
 
-GROWTH = 4.25  # times the rays there are may be there after another round: the error is known better then
-LEAST = 2**18  # rays that a target takes at least: fewer do not show what is rare
-LEAST_EVEN = 2**17  # where noise is even: fewer may miss what is rare in a small picture
-MORE = 2  # times the rays are doubled where the tail of their values is in doubt
-EVEN = 0.25  # of the mean deviation is the least that a pixel is given rays for, until there are as many
-SHY = 0.85  # of the rays that a target seems to want, until there are as many
-NEAR = 1.05  # times a target is an error that reaches it, as far as it is known
-RARE = 0.92  # of the target is aimed at where rare rays may rule: some of them are not met yet
-LEAST_GROWTH = 1.05  # fewer rays, and a round costs more than it brings
+GROWTH = 4.25  # maximum growth of the ray count per round: the error is known better then
+MIN_GROWTH = 1.05  # minimum growth for which another round pays off
+MIN_RAYS = 2**18  # of a picture with a target: fewer do not show what is rare
+MIN_RAYS_WIDESPREAD = 2**17  # where noise is widespread
+MIN_SPP = 256  # rays of a pixel that a target takes at least, in a picture so small that this is less
+MAX_TAIL_DOUBLINGS = 2  # of the ray count, while the tail is heavy
+WIDESPREAD_NOISE = 0.2  # fraction of noisy pixels from which noise is widespread
+MIN_RELATIVE_DEVIATION = 0.25  # fraction of the mean deviation that each pixel has, until there are MIN_RAYS
+INITIAL_FRACTION = 0.85  # of the predicted rays to trace before the prediction is trusted
+TARGET_MARGIN = 0.95  # fraction of the target aimed for: a forecast is as often too low as too high
 
 OnRound = Callable[[RoundPicture], object]
 Stage = Callable[[str, int, str], AbstractContextManager[Advance]]
 
 
 class Finished(NamedTuple):
-    """What rounds came to."""
+    """Result of the adaptive rounds."""
 
     rounds: list[Round]
-    state: State
+    stats: SampleStatistics
     error: ErrorEstimate
 
 
-class Next(NamedTuple):
-    """What a further round traces."""
+@dataclass(frozen=True)
+class NextRound:
+    """Allocation of a further round."""
 
-    chosen: np.ndarray  #: numbers of groups, see ``Noise``
-    last: bool  #: halves have decided for each other, and so no other round may follow
-    doubled: int = 0  #: times that rays were doubled in doubt
+    allocation: np.ndarray  #: groups of rays, see ``allocate.py``
+    final: bool  #: halves have decided for each other
+    doublings: int = 0  #: of the ray count, for a heavy tail
 
 
-def run_rounds(noise: Noise, stage: Stage, goal: Goal, on_round: OnRound | None = None) -> Finished:
+class Tracer:
+    """Traces the rays of allocations, and adds their values up in four buffers."""
+
+    def __init__(self, exposer: Exposer, seed: int) -> None:
+        samplers = plugin("samplers", "mrt_mitsuba.adaptive")
+        self.film = exposer.film
+        self.sampler = mi.load_dict({"type": samplers.ADAPTIVE})
+        self.allocator = Allocator(self.film, self.sampler, seed)
+        self.initial_allocation = np.ones((4, self.film.pixels), np.int64)
+        self._exposer = exposer
+        self._seed = seed
+
+    def cost(self, allocation: np.ndarray) -> int:
+        """Number of rays that an allocation traces."""
+        return self.sampler.group * int(self.allocator.traced(allocation).sum())
+
+    def blank(self, metric: str) -> SampleStatistics:
+        """Statistics before any ray is traced."""
+        return SampleStatistics.blank(self.film, len(self._exposer.names), METRICS[metric])
+
+    def trace(self, stats: SampleStatistics, allocation: np.ndarray, advance: Advance) -> SampleStatistics:
+        """Return statistics with the rays of an allocation."""
+        groups = RayBatch.from_counts(self.sampler.group, self.allocator.traced(allocation), stats.count)
+        samples = film_samples(self.film, self._seed, self.sampler)
+        exposed = self._exposer.expose(groups, samples, pictures=4, moments=True, advance=advance)
+        total, peak = exposed.total, exposed.peak
+        square = exposed.square.mean(0)
+        invalid, worst = stats.invalid, stats.worst_invalid
+        new = ~np.isfinite(square)
+        if new.any():
+            invalid = invalid | new.any(0)
+            largest = total[:, new].max()
+            worst = float(peak[new].max() if np.isfinite(largest) else largest)
+            for values in (*total, square, peak):
+                values[new] = 0
+        pilots = stats.pilots
+        with np.errstate(invalid="ignore"):
+            halves = stats.halves.accumulate(exposed, allocation[:2] > 0)
+            if pilots is not None:
+                pilots = pilots.accumulate(exposed, allocation[2:] > 0, first=2)
+        return SampleStatistics(
+            metric=stats.metric,
+            count=stats.count + exposed.rays.reshape(stats.count.shape),
+            sum=stats.sum + total,
+            sum_sq=stats.sum_sq + square,
+            max_ray_value=np.maximum(stats.max_ray_value, peak),
+            halves=halves,
+            pilots=pilots,
+            invalid=invalid,
+            worst_invalid=worst,
+            previous_differences=stats.half_differences if stats.count.all() else None,
+        )
+
+
+def run_rounds(
+    tracer: Tracer,
+    stage: Stage,
+    goal: Goal,
+    blurred: Blurred | None = None,
+    on_round: OnRound | None = None,
+) -> Finished:
     """Trace rounds until a goal is reached.
 
-    Warns of a target that is not reached, and of an error that cannot be trusted. ``on_round`` is called
-    after each round, and stops by returning False.
+    Warns of a target that is not reached, and of an error that cannot be trusted. ``blurred``: what is done
+    to the picture in the end, after which errors are estimated. ``on_round`` is called after each round, and
+    stops by returning False.
     """
     start = time.perf_counter()
     done = list[Round]()
     spent = 0
-    pixels = noise.film.pixels
+    pixels = tracer.film.pixels
     target: float | None = None
     stopped = False
-    state = noise.blank()
-    following = Next(noise.begin, last=False)
-    while cost := noise.cost(following.chosen):
+    stats = tracer.blank(goal.metric)
+    following: NextRound | None = NextRound(tracer.initial_allocation, final=False)
+    while following:
+        cost = tracer.cost(following.allocation)
         spent += cost
         with stage("rounds", cost, _message(done, target, cost / pixels)) as advance:
-            state = noise.trace(state, following.chosen, advance)
-        rmse = math.sqrt(float(state.squares(noise.blurred).mean()))
+            stats = tracer.trace(stats, following.allocation, advance)
+        rmse = math.sqrt(float(stats.squared_errors(stats.metric, blurred).mean(-1).mean()))
         now = Round(time.perf_counter() - start, spent / pixels, rmse)
         done.append(now)
         if goal.target and target is None:
-            target = goal.target.rmse(state.luminance())
+            target = goal.target.rmse(stats.metric.reference or stats.luminance())
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
-        stopped = on_round is not None and on_round(_shown(now, noise, state, target)) is False
-        if stopped or target == 0 or following.last:
+        stopped = on_round is not None and on_round(_shown(now, stats, target, blurred)) is False
+        if stopped or target == 0:
             break
-        most = min(goal.most, GROWTH * now.spp)
-        if goal.seconds is not None:
-            most = min(most, now.spp * goal.seconds / now.seconds)
-        if most < LEAST_GROWTH * now.spp:
-            break
-        following = _next(noise, state, now.spp, most, goal.most, target, following)
-    error = replace(estimate(noise, state), target=target)
-    found = [state.unfit_rays(), _doubt(error), "" if stopped else _missed(goal, now, error)]
-    if any(found):
-        warn("; ".join(filter(None, found)))
-    return Finished(done, state, error)
+        following = plan_round(tracer.allocator, stats, goal, target, now, following)
+    error = replace(estimate_error(stats, blurred), target=target)
+    warnings = [stats.invalid_warning(), _tail_warning(error)]
+    if not stopped:
+        warnings.append(_target_warning(goal, now, target))
+    if any(warnings):
+        warn("; ".join(filter(None, warnings)))
+    return Finished(done, stats, error)
 
 
-def _next(
-    noise: Noise, state: State, spp: float, most: float, rays: float, target: float | None, before: Next
-) -> Next:
-    """What to trace after ``spp`` rays a pixel, of which there may be ``most`` after the next round, and
-    ``rays`` in the end."""
-    if target is None and most >= rays:
-        return Next(noise.last_shares(state, rays, None), last=True)
-    forecast = noise.forecast(state)
-    margin = noise.margin * (RARE if forecast.rare else 1)
-    aim = None if target is None else margin * max(target, 1e-100)
-    wanted = rays if aim is None else noise.wanted(state, forecast, aim)
-    least = 0.0 if aim is None else _least(noise, forecast, rays)
-    even = 0.0
-    doubled = before.doubled
-    if spp < 0.9 * least:  # shares are rounded
-        most = min(most, max(least, SHY * wanted))
-        aim = None
-        even = EVEN
-    elif target is not None and forecast.rmse <= target:
-        if forecast.tail <= DOUBTFUL or doubled == MORE:  # the halves know what is missing, if anything
-            return Next(noise.last_shares(state, most, aim), last=True)
-        most = min(most, 2 * spp)
-        doubled += 1
-        aim = None
-    elif wanted <= most:
-        return Next(noise.last_shares(state, rays, aim), last=True)
-    elif aim is not None:  # no more than it takes where variance falls as fast as it may
-        most = min(most, spp * (wanted / spp) ** (1 / (1 + noise.gain)))
-    if most >= rays:
-        return Next(noise.last_shares(state, rays, aim), last=True)
-    return Next(noise.shares(state, forecast, most, even), False, doubled)
+def plan_round(
+    allocator: Allocator,
+    stats: SampleStatistics,
+    goal: Goal,
+    target: float | None,
+    now: Round,
+    before: NextRound,
+) -> NextRound | None:
+    """Return the next round after ``now``, or None if the goal is reached."""
+    most = min(goal.max_spp, GROWTH * now.spp)
+    if goal.max_seconds is not None:
+        most = min(most, now.spp * goal.max_seconds / now.seconds)
+    if most < MIN_GROWTH * now.spp:
+        return None
+    aim = None if target is None else TARGET_MARGIN * max(target, 1e-100)
+    if not before.final:
+        following = _plan_by_pilots(allocator, stats, goal.max_spp, most, aim, now.spp, before.doublings)
+        if following.allocation.any():
+            return following
+    return None if aim is None else _top_up(allocator, stats, most, aim, now)
 
 
-def _least(noise: Noise, forecast: Forecast, rays: float) -> float:
-    """The mean rays of a pixel that a target takes at least."""
-    least = LEAST_EVEN if forecast.even else LEAST
-    return min(rays, noise.least, least / noise.film.pixels)
+def _top_up(
+    allocator: Allocator, stats: SampleStatistics, most: float, aim: float, now: Round
+) -> NextRound | None:
+    """Return a round that lowers the picture's own error to its target; None if it is there."""
+    if now.rmse * TARGET_MARGIN <= aim:
+        return None
+    most = min(most, now.spp * max((now.rmse / aim) ** 2, 2 * MIN_GROWTH - 1))
+    return NextRound(allocator.allocate_final(stats, most, None), final=True)
 
 
-def _shown(now: Round, noise: Noise, state: State, target: float | None) -> RoundPicture:
-    """A round with copies of its picture, its error and its rays."""
-    image = state.image()[..., :3]
-    if noise.blurred is not None:
-        image = noise.blurred(image)
-    deviation = np.sqrt(noise.variance(state).mean(-1))
-    with np.errstate(over="ignore"):  # of errors beyond float32
+def _plan_by_pilots(
+    allocator: Allocator,
+    stats: SampleStatistics,
+    max_spp: float,
+    most: float,
+    aim: float | None,
+    spp: float,
+    doublings: int,
+) -> NextRound:
+    """Return the next round after ``spp`` rays a pixel, at most ``most`` after it and ``max_spp`` in all.
+
+    ``aim``: the RMSE to reach; None: all rays are spent.
+    """
+    if aim is None and most >= max_spp:
+        return NextRound(allocator.allocate_final(stats, most, None), final=True)
+    seen = forecast(stats)
+    floor = 0.0
+    if aim is not None:
+        required = allocator.required_spp(stats, seen, aim)
+        minimum = min(_min_spp(stats, seen), max_spp)
+        if spp < 0.9 * minimum:  # allocations are rounded
+            most = min(most, max(minimum, INITIAL_FRACTION * required))
+            floor = MIN_RELATIVE_DEVIATION
+            aim = None
+        elif required > most:  # cap at the fastest possible decay, spp^−(1 + gain)
+            most = min(most, spp * (required / spp) ** (1 / (1 + allocator.gain)))
+        elif seen.tail > PARETO_K_THRESHOLD and doublings < MAX_TAIL_DOUBLINGS and required <= spp:
+            most = min(most, 2 * spp)
+            doublings += 1
+        else:
+            return NextRound(allocator.allocate_final(stats, most, aim), final=True)
+        if most >= max_spp:
+            return NextRound(allocator.allocate_final(stats, most, aim), final=True)
+    return NextRound(allocator.allocate(stats, seen, most, floor), final=False, doublings=doublings)
+
+
+def _min_spp(stats: SampleStatistics, seen: Forecast) -> float:
+    """Return the mean rays of a pixel that a target takes at least."""
+    widespread = seen.noisy_fraction > WIDESPREAD_NOISE and seen.tail < HEAVY_TAIL_SHAPE
+    return min(MIN_SPP, (MIN_RAYS_WIDESPREAD if widespread else MIN_RAYS) / stats.film.pixels)
+
+
+def _shown(
+    now: Round, stats: SampleStatistics, target: float | None, blurred: Blurred | None
+) -> RoundPicture:
+    """Return a round with copies of its picture, its error and its rays."""
+    image = stats.image()[..., :3]
+    if blurred is not None:
+        image = blurred(image)
+    error = pixel_error(stats, pixel_variance(stats, blurred), blurred)
+    with np.errstate(over="ignore"):  # errors beyond float32
         return RoundPicture(
             seconds=now.seconds,
             spp=now.spp,
             rmse=now.rmse,
             image=np.array(image, np.float32),
-            error=deviation.astype(np.float32),
-            samples=np.array(state.samples(), np.float32),
+            error=error.astype(np.float32),
+            samples=np.array(stats.samples(), np.float32),
             target=target,
         )
 
 
-def _doubt(error: ErrorEstimate) -> str:
-    """What makes an error one not to be trusted; nothing if nothing does."""
-    if error.tail <= DOUBTFUL:
+def _tail_warning(error: ErrorEstimate) -> str:
+    """Return a warning if the error estimate is unreliable, else ""."""
+    if error.tail <= PARETO_K_THRESHOLD:
         return ""
     return (
-        f"a few rays rule the error of {error.rmse:.3g}, and it may be larger by any amount: the tail of "
-        f"what rays contribute has a Pareto shape of {error.tail:.2g}, above {DOUBTFUL}. What helps: "
-        "another integrator, larger lamps or rougher materials where such rays come from, or more rays"
+        f"a few rays dominate the error estimate of {error.rmse:.3g}, and the error may be larger by any "
+        f"amount: the tail of what rays contribute has a Pareto shape of {error.tail:.2g}, above "
+        f"{PARETO_K_THRESHOLD}. Another integrator, larger lamps or rougher materials where such rays come "
+        "from, or more rays help"
     )
 
 
-def _missed(goal: Goal, now: Round, error: ErrorEstimate) -> str:
-    """Why an error is larger than was asked for; nothing if it is not."""
-    target, rays, seconds = error.target, goal.most, goal.seconds
+def _target_warning(goal: Goal, now: Round, target: float | None) -> str:
+    """Return a warning if the target was not reached, else ""."""
     if target == 0:
         return (
             f"target={goal.target}: the picture is black, as far as pilot rays have met it, and so a share "
@@ -172,21 +281,18 @@ def _missed(goal: Goal, now: Round, error: ErrorEstimate) -> str:
     if goal.target is None or target is None or now.rmse <= target:
         return ""
     asked = f"target={goal.target}, which is {target:.3g}," if goal.target.relative else f"target={target:g}"
-    spent = f"an error of {now.rmse:.3g}, after {now.spp:.1f} rays a pixel and {now.seconds:.1f} s"
-    late = seconds is not None and seconds < LEAST_GROWTH * now.seconds
-    if late or now.spp * LEAST_GROWTH > rays:
-        limit = f"maxseconds={seconds:g}" if late else f"maxspp={rays}"
-        return f"{asked} is not reached: {limit} ends the render at {spent}"
-    if now.rmse <= NEAR * target:
-        return ""
+    metric = "" if goal.metric == LINEAR.name else f"{goal.metric} "
+    seconds = goal.max_seconds
+    late = seconds is not None and seconds < MIN_GROWTH * now.seconds
+    limit = f"maxseconds={seconds:g}" if late else f"maxspp={goal.max_spp}"
     return (
-        f"{asked} is missed by {spent}: rays that are not in the picture decide when to stop, and "
-        "met less noise. A smaller target helps"
+        f"{asked} is not reached: {limit} ends the render at a {metric}error of {now.rmse:.3g}, after "
+        f"{now.spp:.1f} rays a pixel and {now.seconds:.1f} s"
     )
 
 
 def _message(done: list[Round], target: float | None, more: float) -> str:
-    """Where a render stands before a round of so many rays a pixel."""
+    """Return where a render stands before a round of ``more`` spp."""
     if not done:
         return ""
     now = done[-1]

@@ -7,6 +7,7 @@ from abc import ABC
 from dataclasses import dataclass
 
 PERCENT = "%"
+METRIC_NAMES = ("linear", "relative", "display")
 
 
 def plain(text: str) -> str:
@@ -18,13 +19,15 @@ def plain(text: str) -> str:
 
 @dataclass(frozen=True)
 class Target:
-    """An RMSE to the converged picture, linear: a number, or a share of the picture's mean luminance.
+    """An RMSE to the converged picture: a number, or a percentage.
+
+    A percentage is one of the picture's mean luminance or, of values on a display, of full white.
 
     ``str()`` writes it as an option takes it: "0.01" or "2%". Raises ``ValueError`` for a value that cannot
     be reached: zero, negative or not finite.
     """
 
-    value: float  #: of a relative target the share, 0.02 for 2 %
+    value: float  #: of a percentage the fraction, 0.02 for 2 %
     relative: bool = False
 
     def __post_init__(self) -> None:
@@ -52,9 +55,9 @@ class Target:
         """The number, or the text of a percentage: what JSON can hold, and ``of`` reads."""
         return str(self) if self.relative else self.value
 
-    def rmse(self, luminance: float) -> float:
-        """The RMSE to reach in a picture of this mean luminance, linear."""
-        return self.value * luminance if self.relative else self.value
+    def rmse(self, reference: float) -> float:
+        """The RMSE to reach, where ``reference`` is 100 %."""
+        return self.value * reference if self.relative else self.value
 
     def __str__(self) -> str:
         return f"{100 * self.value:g}{PERCENT}" if self.relative else f"{self.value:g}"
@@ -62,15 +65,16 @@ class Target:
 
 @dataclass(frozen=True)
 class Goal:
-    """The end of rounds of rays: a target, or until their rays or seconds are spent."""
+    """When adaptive rounds end: at a target, or when their rays or seconds are spent."""
 
     target: Target | None  #: None: all rays are spent
-    most: int  #: rays of a pixel, on average
-    seconds: float | None = None  #: None: no limit
+    max_spp: int  #: rays of a pixel, on average
+    max_seconds: float | None = None  #: None: no limit
+    metric: str = "linear"  #: of the error, one of ``METRIC_NAMES``
 
 
-class StatesGoal(ABC):  # registered, as Mitsuba's classes take no second base
-    """An integrator that traces no rays itself, but says how far rounds of another one's go."""
+class AdaptiveIntegrator(ABC):  # registered, as Mitsuba's classes take no second base
+    """An integrator that traces no rays itself, but sets the goal of adaptive rounds with another one."""
 
     nested: object  #: the integrator that traces
     goal: Goal

@@ -32,7 +32,7 @@ from mrt_mitsuba.rendering.exposing import FILM_PREFIX
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, make_plan
 from mrt_mitsuba.rendering.progress import Job, Progress, Timings, default_progress
-from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.settings import Convention, Lattice, RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import Source, open_scene, sized
 
@@ -129,9 +129,10 @@ def render(
     aa: int | None = None,
     aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None = None,
     target: Target | float | str | Sequence[float] | None = None,
+    metric: Literal["linear", "relative", "display"] | None = None,
     maxspp: int | None = None,
     maxseconds: float | None = None,
-    lattice: Literal["report", "centered", "film"] | None = None,
+    lattice: Lattice | None = None,
     fresnel: Literal["schlick", "dielectric"] | None = None,
     focaldist: float | None = None,
     focalrange: float | None = None,
@@ -140,8 +141,8 @@ def render(
     motion: Sequence[float] | None = None,
     motionsamples: int = 16,
     motionmode: Literal["frames", "stratified"] = "frames",
-    convention: Literal["report", "standard"] = "report",
-    texturing: Literal["report", "standard"] | None = None,
+    convention: Convention = "report",
+    texturing: Convention | None = None,
     camera: Sequence[float] | None = None,
     up: Sequence[float] | None = None,
     fov: float | None = None,

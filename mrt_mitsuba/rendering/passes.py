@@ -138,25 +138,25 @@ class Passes:
 
     def _run_rounds(self, step: Rounds, exposer: Exposer) -> None:
         """Expose pixels until the noise is as low as was asked for."""
-        from mrt_mitsuba.adaptive.noise import Noise, RayNoise
-        from mrt_mitsuba.adaptive.rounds import run_rounds
-        from mrt_mitsuba.rendering.whole import PictureNoise
+        from mrt_mitsuba.adaptive.estimate import pixel_error, pixel_variance
+        from mrt_mitsuba.adaptive.rounds import Tracer, run_rounds
 
         # glibc keeps freed blocks up to the size of the largest that was freed, in place of clearing fresh
         # pages (mallopt(3), M_MMAP_THRESHOLD); this one is never written to, and takes no memory
         np.empty(2**25 - 2**16, np.uint8)
         blurred = self._blurred if self._plan.blur else None
-        kind = PictureNoise if self._plan.whole else RayNoise
-        noise: Noise = kind(exposer, self._seed, blurred)
-        finished = run_rounds(noise, self._job.stage, step.goal, self._job.on_round)
+        tracer = Tracer(exposer, self._seed)
+        finished = run_rounds(tracer, self._job.stage, step.goal, blurred, self._job.on_round)
         self.rounds = finished.rounds
         self.error = finished.error
-        self._develop(exposer, finished.state.image())
-        variance = noise.variance(finished.state)[self._seen]
-        with np.errstate(over="ignore"):  # of errors beyond float32
-            self._layer("variance")[:] = variance
-        self._layer("error")[:] = np.sqrt(variance.mean(-1, keepdims=True))
-        self._layer("samples")[..., 0] = finished.state.samples()[self._seen]
+        stats = finished.stats
+        self._develop(exposer, stats.image())
+        variance = pixel_variance(stats, blurred)
+        error = pixel_error(stats, variance, blurred)
+        with np.errstate(over="ignore"):  # errors beyond float32
+            self._layer("variance")[:] = variance[self._seen]
+            self._layer("error")[..., 0] = error[self._seen]
+        self._layer("samples")[..., 0] = stats.samples()[self._seen]
 
     def _develop(self, exposer: Exposer, picture: np.ndarray) -> None:
         """Turn what is exposed, [H, W, channels], into layers."""

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import mitsuba as mi
 
+from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
 from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
@@ -111,13 +112,16 @@ class Rounds(Pass):
 
     def __str__(self) -> str:
         goal = self.goal
+        metric = METRICS[goal.metric]
+        kind = "an error" if metric is LINEAR else f"a {metric.name} error"
         if goal.target is None:
-            return f"rounds of rays, {goal.most} a pixel on average, where the variance is"
+            where = "the variance" if metric is LINEAR else f"the {metric.name} error"
+            return f"adaptive sampling: {goal.max_spp} spp on average, allocated by {where}"
         error = str(goal.target)
-        if goal.target.relative:
+        if goal.target.relative and metric.reference is None:
             error += " of the mean luminance" + ("" if self.rmse is None else f", {self.rmse:.3g}")
-        seconds = "" if goal.seconds is None else f" or {goal.seconds:g} s"
-        return f"rounds of rays, to an error of {error}, at most {goal.most} a pixel{seconds}"
+        seconds = "" if goal.max_seconds is None else f" or {goal.max_seconds:g} s"
+        return f"adaptive sampling to {kind} of {error}, at most {goal.max_spp} spp{seconds}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,7 +243,7 @@ def _decide(settings: RenderSettings, source: Source, shader: Shader) -> _Choice
     aa = settings.aa or (1 if one else AA)
     spp = settings.spp or 1
     if goal and goal.target is None:
-        spp = goal.most
+        spp = goal.max_spp
     elif settings.spp is None and source.own and plain and settings.aamode is None:
         spp = shader.film.rays
     lattice = settings.lattice or (FILM if source.own or whole or goal else "report")
@@ -326,9 +330,9 @@ def _in_force(choices: _Choices, source: Source, shader: Shader, returned: froze
         "integrator": shader.name,
     }
     if goal and goal.target:
-        values |= {"target": goal.target.plain, "maxspp": goal.most}
+        values |= {"target": goal.target.plain, "maxspp": goal.max_spp}
     if goal:
-        values["maxseconds"] = goal.seconds
+        values |= {"maxseconds": goal.max_seconds, "metric": goal.metric}
     return {name: values[name] for name in _NAMED if values[name] is not None}
 
 
@@ -355,7 +359,7 @@ def _check(choices: _Choices, source: Source, shader: Shader) -> None:
     goal = choices.goal
     if goal is None:
         only = "{0} is of use only where rays go in rounds: with target or aamode=noise"
-        _refuse(settings, ("maxspp", "maxseconds", "on_round"), (), only)
+        _refuse(settings, ("metric", "maxspp", "maxseconds", "on_round"), (), only)
     else:
         name = f"target={goal.target}" if goal.target else "aamode=noise"
         both = (
@@ -366,9 +370,14 @@ def _check(choices: _Choices, source: Source, shader: Shader) -> None:
             _refuse(settings, ("aamode", "spp"), (NOISE,), both)
         _refuse(settings, ("aa", "lattice", "region"), (FILM,), both)
     if shader.whole:
+        if goal is not None:
+            raise UsageError(
+                f"{name}: the integrator {shader.name} gives whole pictures, not single rays; "
+                "write spp, or choose another, such as path"
+            )
         alone = f"the integrator {shader.name} gives whole pictures, and no single rays"
         leave = f"{{0}}={{1}}: {alone}; leave it out, or choose another, such as path"
-        _refuse(settings, ("aamode", "lattice", "motion"), ("none", NOISE, FILM), leave)
+        _refuse(settings, ("aamode", "lattice", "motion"), ("none", FILM), leave)
         if choices.focaldist:
             raise UsageError(
                 f"focaldist={choices.focaldist}: {alone}; write focaldist=0, or choose another, such as path"

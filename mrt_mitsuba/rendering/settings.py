@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
-from mrt_mitsuba.adaptive.target import Goal, Target
+from mrt_mitsuba.adaptive.target import METRIC_NAMES, Goal, Target
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.files.layers import LAYERS
 from mrt_mitsuba.options import (
@@ -41,6 +41,8 @@ from mrt_mitsuba.scene.model import CONVENTION, FRESNEL, MODEL_OPTIONS, SIDE, SI
 if TYPE_CHECKING:
     from mrt_mitsuba.adaptive.error import RoundPicture
 
+Convention = Literal["report", "standard"]
+Lattice = Literal["report", "centered", "film"]
 #: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
 #: the order of its arguments; those of the picture can distinguish noise from edges
 DETECTORS = {"luma": ("image",), "sobel": ("image",), "geometry": ("normal", "depth")}
@@ -62,9 +64,10 @@ class SharedOptions(TypedDict, total=False):
     aa: int | None
     aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None
     target: Target | float | str | Sequence[float] | None
+    metric: Literal["linear", "relative", "display"] | None
     maxspp: int | None
     maxseconds: float | None
-    lattice: Literal["report", "centered", "film"] | None
+    lattice: Lattice | None
     fresnel: Literal["schlick", "dielectric"] | None
     focaldist: float | None
     focalrange: float | None
@@ -73,8 +76,8 @@ class SharedOptions(TypedDict, total=False):
     motion: Sequence[float] | None
     motionsamples: int
     motionmode: Literal["frames", "stratified"]
-    convention: Literal["report", "standard"]
-    texturing: Literal["report", "standard"] | None
+    convention: Convention
+    texturing: Convention | None
     camera: Sequence[float] | None
     up: Sequence[float] | None
     fov: float | None
@@ -118,9 +121,16 @@ class RenderSettings:
     target: Target | tuple[float, ...] | None = option(
         None,
         TARGET,
-        "error to render to: an RMSE, linear, or a percentage of the picture's mean luminance, such as 2%; "
+        "error to render to: an RMSE, or a percentage such as 2% of the picture's mean luminance or, with "
+        "metric=display, of white; "
         "OBJ file: what the camera looks at",
         "none",
+    )
+    metric: str | None = option(
+        None,
+        choice(*METRIC_NAMES),
+        "error of target and aamode=noise: RMSE of linear values, relative to them, or of sRGB in [0, 1]",
+        METRIC_NAMES[0],
     )
     maxspp: int | None = option(
         None, integer(MIN_SPP, 2**24), "rays of a pixel at most, with a target, on average", str(MAX_SPP)
@@ -235,19 +245,20 @@ class RenderSettings:
         ``stated``: what the scene's integrator says, for where no option says how many rays a pixel gets.
         Raises ``UsageError`` for too few rays.
         """
+        metric = self.metric or METRIC_NAMES[0]
         if self.error is not None:
-            return Goal(self.error, self.maxspp or MAX_SPP, self.maxseconds)
+            return Goal(self.error, self.maxspp or MAX_SPP, self.maxseconds, metric)
         if self.aamode == NOISE:
             mean = self.spp or 1
             if mean < MIN_SPP:
                 raise UsageError(
                     f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
                 )
-            return Goal(None, self.maxspp or mean, self.maxseconds)
+            return Goal(None, min(mean, self.maxspp or mean), self.maxseconds, metric)
         if stated is None or self.aamode is not None or self.spp is not None:
             return None
-        seconds = stated.seconds if self.maxseconds is None else self.maxseconds
-        return Goal(stated.target, self.maxspp or stated.most, seconds)
+        seconds = stated.max_seconds if self.maxseconds is None else self.maxseconds
+        return Goal(stated.target, self.maxspp or stated.max_spp, seconds, self.metric or stated.metric)
 
     def model(self) -> dict[str, Any]:
         """The options given about a model and its view, as ``obj.obj_scene`` takes them.

@@ -11,7 +11,7 @@ from typing import Any, SupportsIndex
 
 import mitsuba as mi
 
-from mrt_mitsuba.adaptive.target import Goal, StatesGoal, Target
+from mrt_mitsuba.adaptive.target import AdaptiveIntegrator, Goal, Target
 from mrt_mitsuba.errors import SceneError, UsageError, warn
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import Values, is_obj, is_path
@@ -199,7 +199,7 @@ def opened(name: str, scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integra
     if not 0 <= radius <= WIDEST_FILTER:
         raise SceneError(f"{name} has a filter of radius {radius:g}: give at most {WIDEST_FILTER} pixels")
     goal = None
-    if isinstance(integrator, StatesGoal):
+    if isinstance(integrator, AdaptiveIntegrator):
         goal = integrator.goal
         integrator = integrator.nested
     return Source(name, scene, sensor, integrator, int(width), int(height), own=True, goal=goal)

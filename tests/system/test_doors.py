@@ -99,7 +99,7 @@ goals({"target": 9.0}, {"target": 8.0}, 4096, 8.0, name="a target of the caller'
 def test_a_plan_holds_what_the_integrator_states_and_the_caller_asks(stated, options, most, target):
     result = mrt.render(box(), integrator=mi.load_dict(adaptive(**stated)), **options)
     goal = goal_of(result)
-    assert goal.most == most
+    assert goal.max_spp == most
     assert (goal.target and goal.target.plain) == target
     assert result.options.get("target") == target
 
@@ -107,7 +107,7 @@ def test_a_plan_holds_what_the_integrator_states_and_the_caller_asks(stated, opt
 def test_the_plan_says_what_a_relative_target_is_a_share_of():
     result = mrt.render(box(), integrator="path", target="900%")
     reached = f"{result.error.target:.3g}"
-    assert f"to an error of 900% of the mean luminance, {reached}, at most 4096 a pixel" in str(result.plan)
+    assert f"to an error of 900% of the mean luminance, {reached}, at most 4096 spp" in str(result.plan)
 
 
 def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):

@@ -46,7 +46,6 @@ films(PATH, "", ["R", "G", "B", "error.Y", "samples.Y"])
 films(PATH, CROP + GREY, ["Y", "error.Y", "samples.Y"])
 films(PATH, RGBA, ["R", "G", "B", "A", "error.Y", "samples.Y"])
 films(PRB, "", ["R", "G", "B", "error.Y", "samples.Y"])
-films('<integrator type="ptracer"/>', "", ["R", "G", "B", "error.Y", "samples.Y"], slow=True)
 films(AOV, CROP + RGBA, None)
 
 
@@ -122,9 +121,16 @@ def test_files_and_the_command_know_it(tmp_path, monkeypatch):
     assert list(mi.Bitmap("out.exr").size()) == [24, 16]
 
 
-@pytest.mark.parametrize(
-    "name", ["prb", "prb_basic", "prbvolpath", "direct_projective", "prb_projective", "ptracer"]
-)
+def test_a_target_needs_an_integrator_of_rays():
+    """Light tracing has no rays of pixels to share out: it is rendered with spp."""
+    for options in ({"target": 0.05}, {"aamode": "noise", "spp": 64}):
+        with pytest.raises(mrt.UsageError, match=r"(target=0.05|aamode=noise): .*Particle.* whole pictures"):
+            mrt.render(scene_with(), integrator="ptracer", **options)
+    with pytest.raises(RuntimeError, match="mrt_adaptive: ParticleTracerIntegrator gives whole pictures"):
+        scene_with('<integrator type="ptracer"/>')
+
+
+@pytest.mark.parametrize("name", ["prb", "prb_basic", "prbvolpath", "direct_projective", "prb_projective"])
 def test_every_integrator_gives_pictures_with_their_error(name):
     scene = scene_with()
     integrator = mi.load_dict({"type": name})

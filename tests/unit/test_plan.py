@@ -110,6 +110,7 @@ VALUES = {
     "aa": 1,
     "aamode": "none",
     "target": 0.5,
+    "metric": "display",
     "maxspp": 64,
     "maxseconds": 60,
     "lattice": "centered",
@@ -138,6 +139,7 @@ MODEL = {"scene": "model.obj"}
 IN_FRONT = scene(ball={**BALL, "center": [0, 0, 4]})
 # What an option needs to make a difference; the others make one in scene 3
 NEEDED = {
+    "metric": TARGET,
     "maxspp": TARGET,
     "maxseconds": TARGET,
     "motionsamples": MOTION,

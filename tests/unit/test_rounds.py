@@ -14,9 +14,10 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.adaptive.error import DOUBTFUL, tail_shape
-from mrt_mitsuba.adaptive.noise import RayNoise, Sums
-from mrt_mitsuba.adaptive.rounds import run_rounds
+from mrt_mitsuba.adaptive import rounds
+from mrt_mitsuba.adaptive.estimate import Sums, forecast, pixel_variance
+from mrt_mitsuba.adaptive.rounds import Tracer, run_rounds
+from mrt_mitsuba.adaptive.tails import PARETO_K_THRESHOLD, tail_shape
 from mrt_mitsuba.adaptive.target import Goal, Target
 from mrt_mitsuba.rendering.film import Film
 
@@ -71,17 +72,24 @@ class Draws:
 
 def _render(exposer: Draws, seed: int = 0, target: Any = None, rays: int = 64, on_round: Any = None) -> Any:
     """Return what a render of drawn values has."""
-    noise = RayNoise(exposer, seed)  # type: ignore[arg-type]
+    tracer = Tracer(exposer, seed)  # type: ignore[arg-type]
     aim = Goal(None if target is None else Target.of(target), rays)
-    rounds, state, error = run_rounds(noise, lambda *_: nullcontext(lambda rays: None), aim, on_round)
+    stage = lambda *_: nullcontext(lambda rays: None)  # noqa: E731
+    done, stats, error = run_rounds(tracer, stage, aim, on_round=on_round)
     return SimpleNamespace(
-        rounds=rounds,
+        rounds=done,
         error=error,
-        rays=state.rays.reshape(4, -1)[:2],
-        image=state.image(),
-        map=np.sqrt(noise.variance(state).mean(-1)),
-        samples=state.samples(),
+        rays=stats.count.reshape(4, -1)[:2],
+        image=stats.image(),
+        map=np.sqrt(pixel_variance(stats, None).mean(-1)),
+        samples=stats.samples(),
     )
+
+
+@pytest.fixture
+def no_top_ups(monkeypatch):
+    """Halves decide for each other once, and not by the error of the picture itself."""
+    monkeypatch.setattr(rounds, "_top_up", lambda *_: None)
 
 
 def _rare(share: float, pixels: int = PIXELS, bright: float = 200) -> Draw:
@@ -98,6 +106,7 @@ def _calm(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
     return 1 + (0.1 + pixel / PIXELS) * rng.normal(size=len(pixel))
 
 
+@pytest.mark.usefixtures("no_top_ups")
 @pytest.mark.parametrize("half", [0, 1])
 @pytest.mark.parametrize("color", [0, 1])
 @pytest.mark.parametrize(
@@ -141,6 +150,7 @@ def _paired(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
     return 1 + (0.1 + pixel / PIXELS) * (2 * signs + rng.normal(size=len(pixel)) * first)
 
 
+@pytest.mark.usefixtures("no_top_ups")
 @pytest.mark.parametrize("half", [0, 1])
 @pytest.mark.parametrize("color", [0, 1])
 def test_no_value_decides_by_how_much_a_sequence_gains(half, color):
@@ -164,6 +174,7 @@ def test_no_value_decides_by_how_much_a_sequence_gains(half, color):
     assert_array_equal(changed.rays[half][there], plain.rays[half][there])
 
 
+@pytest.mark.usefixtures("no_top_ups")
 @pytest.mark.parametrize("half", [0, 1])
 @pytest.mark.parametrize("goal", [{"rays": 64}, {"target": 0.05, "rays": 2000}])
 def test_under_a_filter_no_value_decides_its_weight(half, goal):
@@ -232,10 +243,11 @@ def test_a_forecast_is_the_error_of_the_mean_of_both_halves(groups):
 
     squares = []
     for seed in range(40):
-        noise = RayNoise(Draws(draw), seed)  # type: ignore[arg-type]
-        state = noise.trace(noise.blank(), groups * noise.begin, lambda rays: None)
-        squares.append(noise.forecast(state).rmse ** 2)
-    rays = state.rays[:2].sum(0)
+        tracer = Tracer(Draws(draw), seed)  # type: ignore[arg-type]
+        first = groups * tracer.initial_allocation
+        stats = tracer.trace(tracer.blank("linear"), first, lambda rays: None)
+        squares.append(forecast(stats).rmse ** 2)
+    rays = stats.count[:2].sum(0)
     assert (rays == 4 * groups).all()
     assert np.mean(squares) ** 0.5 == pytest.approx(rays.mean() ** -0.5, rel=0.08)
 
@@ -252,7 +264,7 @@ def test_rays_are_doubled_twice_where_few_of_them_rule(tail, times):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", mrt.MrtWarning)
             result = _render(Draws(draw), seed, target=1e12, rays=5000)
-        assert (result.error.tail > DOUBTFUL) == (times > 1)
+        assert (result.error.tail > PARETO_K_THRESHOLD) == (times > 1)
         assert result.rounds[-1].spp == pytest.approx(256 * times, rel=0.15)
 
 
@@ -274,7 +286,7 @@ def test_what_many_values_rule_is_no_matter_of_doubt(bright, doubtful):
     """Of two kinds of pixels, the brighter ones have half of the squares: by their shape, a heavy tail."""
     near = np.linspace(1, 1.1, 30 * bright)
     values = np.concatenate([100 * near[:bright], 16 * near])
-    assert (tail_shape(values, np.ones_like(values)) > DOUBTFUL) == doubtful
+    assert (tail_shape(values, np.ones_like(values)) > PARETO_K_THRESHOLD) == doubtful
 
 
 @pytest.mark.parametrize(("draw", "doubtful"), [(_calm, False), (_rare(0.3), False), (_rare(0.003, 8), True)])
@@ -287,7 +299,7 @@ def test_doubt_is_for_errors_that_few_rays_rule(draw, doubtful):
     assert len(ruled) > 9
     assert share >= 0.9 if doubtful else share == 0
     assert ["tail" in str(w.message) for w in warned].count(True) == sum(
-        r.error.tail > DOUBTFUL for r in results
+        r.error.tail > PARETO_K_THRESHOLD for r in results
     )
 
 
@@ -387,10 +399,12 @@ def test_shares_take_all_the_room_there_is_and_no_more(rfilter, least):
     def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
         return (0.1 + (pixel % SIDE == 3) + (pixel < 2 * SIDE)) * rng.normal(size=len(pixel))
 
-    noise = RayNoise(Draws(draw, rfilter=rfilter), seed=0)  # type: ignore[arg-type]
-    state = noise.trace(noise.blank(), noise.begin, lambda rays: None)
-    forecast = noise.forecast(state)
+    tracer = Tracer(Draws(draw, rfilter=rfilter), seed=0)  # type: ignore[arg-type]
+    stats = tracer.trace(tracer.blank("linear"), tracer.initial_allocation, lambda rays: None)
+    seen = forecast(stats)
+    allocator = tracer.allocator
     for most in np.linspace(20, 40, 101):
-        for chosen in (noise.shares(state, forecast, most, 0.25), noise.last_shares(state, most, None)):
-            taken = (noise.cost(chosen) / PIXELS + 8) / most
+        by_pilots = allocator.allocate(stats, seen, most, 0.25)
+        for allocation in (by_pilots, allocator.allocate_final(stats, most, None)):
+            taken = (tracer.cost(allocation) / PIXELS + 8) / most
             assert least < taken <= 1.005, most  # scouts are rounded by themselves
