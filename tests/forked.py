@@ -9,7 +9,7 @@ from pathlib import Path
 
 PROCESSES = multiprocessing.get_context("forkserver")
 # Before anything chooses a variant of Mitsuba, so that no thread is lost with the fork
-PROCESSES.set_forkserver_preload(["pytest", "mrt_mitsuba.validation.figures", "forked"])
+PROCESSES.set_forkserver_preload(["pytest", "mrt_mitsuba.validation.work_precision", "forked"])
 
 
 def run(code: str, path: Path) -> None:

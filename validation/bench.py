@@ -1,9 +1,7 @@
-"""``make bench``: the times that matter to users, as JSON, compared with an earlier file or version.
+"""``make bench``: seconds of renders that matter to users, in turns with an earlier version (``--before``).
 
-The start of the command against a bare start of Mitsuba; scenes 0 to 4 at 800x600, many objects, renders to
-an error and small renders; and this project's plugins against Mitsuba's own. You cannot compare seconds from
-two machines, or under two loads, but you can compare ratios of the same run. With ``--before``, every render
-takes turns with an earlier version. Takes about ten minutes.
+You cannot compare seconds from two machines, or under two loads, but ratios of the same run. Each side runs
+in a process of its own, by public names only, which the earlier version has, too.
 """
 
 from __future__ import annotations
@@ -11,121 +9,146 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import MrtError, UsageError
-from mrt_mitsuba.files.replacing import replacing
-from mrt_mitsuba.validation import renders
-from mrt_mitsuba.validation.study import in_turns, machine, prepare_folder, ratio, ratio_of
+import numpy as np
 
-START_GOAL = 1.7
-DEVICE_SIZES = (800, 600), (4096, 4096)
-# What any program on Mitsuba waits for: import, variant, one kernel
-BARE = """
-from mrt_mitsuba import llvm
-import mitsuba as mi, drjit as dr
-mi.set_variant("llvm_ad_rgb")
-dr.eval(dr.arange(mi.Float, 16) + dr.opaque(mi.Float, 1))
-dr.sync_thread()
-"""
+import mrt_mitsuba as mrt
 
-# A row has "seconds"; compared with another side, it has those of ``ratio_of``, and a "goal" of the ratio.
-# "to then": how many times the ratio, or else the seconds, are those of an earlier file
-COLUMNS = ("seconds", "other_seconds", "ratio", "low", "high", "goal", "to then")
-Row = dict[str, float]
+# isort: split
+import mitsuba as mi  # after ours, which finds LLVM for it
+
+Nodes = dict[str, Any]
+Run = Callable[[], object]
+Case = tuple[int, Callable[[], Run]]  # number of runs to average, and what makes the run
+
+ONE_RAY: Nodes = {"aamode": "none", "aa": 1, "lattice": "report", "focaldist": 0}
+SUPERSAMPLED: Nodes = ONE_RAY | {"aa": 4}
+SIZE: Nodes = {"width": 400, "height": 300}
+SMALL: Nodes = {"width": 64, "height": 48}
 
 
-def rows(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
-    """Measure; yield each row with its name."""
-    from mrt_mitsuba.validation.studies import speed
-
-    if given.device:
-        runtime.use(given.device)
-        for width, height in DEVICE_SIZES:
-            for pair in speed.against_mitsuba(speed.Extent(width, height, 1, range(5), given.turns, 1)):
-                yield f"{pair.name}, {width}x{height}", speed.compare(pair, given.turns)[0]
-        return
-    yield "mrt out 0 / a bare start of Mitsuba", start(given.turns)
-    yield from cases(given)
-    for pair in () if given.small else speed.against_mitsuba(speed.FULL):
-        yield pair.name, speed.compare(pair, given.turns)[0] | {"goal": pair.goal}
+def with_lights(number: int) -> Nodes:
+    """Return scene 4, small, with so many point lights."""
+    nodes = mrt.scene_dict(4, width=160, height=120)
+    positions = np.outer(np.arange(number), (0.754877666, 0.569840296, 0.362378)) % 1 * 10 + 1
+    for i, position in enumerate(positions.tolist()):  # also in place of its own three
+        intensity = {"type": "rgb", "value": 6 / number}
+        nodes[f"light_{i}"] = {"type": "mrt_light", "position": position, "intensity": intensity}
+    return nodes
 
 
-def start(turns: int) -> Row:
-    """The seconds of the command against those of a bare start, as after installation."""
+def with_triangles(number: int) -> Nodes:
+    """Return scene 0 on a heap of so many small triangles."""
+    rng = np.random.default_rng(5)
+    corners = rng.uniform((-3, -0.2, -3), (3, 0.1, 3), (number, 1, 3)) + rng.normal(0, 0.003, (number, 3, 3))
+    nodes = mrt.scene_dict(0, **SIZE)
+    nodes["plane_0"] = {
+        "type": "mrt_mesh",
+        "positions": mi.Bitmap(corners.reshape(1, -1, 3).astype(np.float32)),
+        "faces": mi.Bitmap(np.arange(3 * number, dtype=np.uint32).reshape(1, -1, 3)),
+        "bsdf": {"type": "ref", "id": "material_4"},
+    }
+    return nodes
+
+
+def with_cones(number: int) -> Nodes:
+    """Return the room of scene 4 with so many cones in place of its spheres."""
+    room = mrt.scene_dict(4, **SIZE)
+    nodes = {name: node for name, node in room.items() if not name.startswith("sphere")}
+    rng = np.random.default_rng(5)
+    bases = rng.uniform((1, 0, 1), (7.5, 6.5, 7.5), (number, 3))
+    tips = bases + rng.normal(0, 0.2, (number, 3))
+    for i, (tip, base) in enumerate(zip(tips.tolist(), bases.tolist(), strict=True)):
+        cone = {"type": "mrt_cone", "apex": tip, "base_center": base, "radius": 0.15}
+        nodes[f"cone_{i}"] = cone | {"bsdf": {"type": "ref", "id": "material_0"}}
+    return nodes
+
+
+def render(nodes: Callable[..., Nodes], *arguments: Any, options: Nodes, **size: int) -> Run:
+    """Return a render of a scene that is loaded once."""
+    return partial(mrt.render, mi.load_dict(nodes(*arguments, **size)), **options)
+
+
+def prepared() -> Run:
+    """Return a prepared render."""
+    return mrt.prepare(mi.load_dict(mrt.scene_dict(3, **SMALL)), **ONE_RAY)
+
+
+def command() -> Run:
+    """Return a run of ``mrt out 0`` in a process of its own."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-
-    def python(*arguments: str) -> partial[Any]:
-        silent: dict[str, Any] = {"check": True, "stdout": subprocess.DEVNULL, "timeout": 600}
-        return partial(subprocess.run, [sys.executable, *arguments], env=environment, **silent)
-
-    with tempfile.TemporaryDirectory() as folder:
-        command = python("-m", "mrt_mitsuba.command.main", f"{folder}/out", "0", "quiet=1")
-        return ratio(command, python("-c", BARE), repeats=turns) | {"goal": START_GOAL}
+    words = [sys.executable, "-m", "mrt_mitsuba.command.main", f"{tempfile.mkdtemp()}/out", "0", "quiet=1"]
+    return partial(subprocess.run, words, check=True, env=environment, stdout=subprocess.DEVNULL)
 
 
-def cases(given: argparse.Namespace) -> Iterator[tuple[str, Row]]:
-    """Yield the cases of ``renders``, each side in a process of its own, in turns."""
-    names = [name for name in renders.CASES if "small" in name or not given.small]
-
-    def measure(python: str, turn: int) -> dict[str, float]:
-        command = [python, str(renders.__file__), *names]
-        ran = subprocess.run(command, check=True, stdout=subprocess.PIPE, timeout=3600)
-        return dict(json.loads(ran.stdout.splitlines()[-1]))
-
-    pythons = [sys.executable, *([given.before] if given.before else [])]
-    found = in_turns([partial(measure, python) for python in pythons], given.turns)
-    for name in names:
-        times = [[run[name] for run in side] for side in found]
-        yield name, ratio_of(*times) if given.before else {"seconds": statistics.median(times[0])}
+LARGE: Nodes = {"options": SUPERSAMPLED, "width": 800, "height": 600}
+CASES: dict[str, Case] = {f"scene {n}": (1, partial(render, mrt.scene_dict, n, **LARGE)) for n in range(5)}
+CASES |= {
+    "a million triangles": (2, partial(render, with_triangles, 10**6, options=SUPERSAMPLED)),
+    "200 lights": (2, partial(render, with_lights, 200, options=ONE_RAY)),
+    "a thousand cones": (2, partial(render, with_cones, 1000, options=SUPERSAMPLED)),
+    "small, loaded": (100, partial(render, mrt.scene_dict, 3, options=ONE_RAY, **SMALL)),
+    "small, prepared": (100, prepared),
+    "mrt out 0": (1, command),
+}
 
 
-def read(path: Path) -> dict[str, Row]:
-    """The rows of an earlier run. Raises ``UsageError`` for any other file."""
-    try:
-        return dict(json.loads(path.read_text())["rows"])
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise UsageError(f"cannot compare with {path}: it is not a file of this benchmark") from error
+def seconds(case: Case) -> float:
+    """Return the mean seconds of warm runs of a case."""
+    number, make = case
+    run = make()
+    for _ in range(1 if number < 10 else 3):
+        run()
+    start = time.perf_counter()
+    for _ in range(number):
+        run()
+    return (time.perf_counter() - start) / number
+
+
+def measured(words: Sequence[str], turn: int) -> dict[str, float]:
+    """Return the seconds of cases, by name, from a process of their own."""
+    ran = subprocess.run(words, check=True, stdout=subprocess.PIPE, timeout=3600)
+    return dict(json.loads(ran.stdout.splitlines()[-1]))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, write JSON, and compare."""
+    """Measure cases, print a row for each, and write them as JSON."""
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
     add = parser.add_argument
+    add("cases", nargs="*", metavar="CASE", help=f"by default all: {', '.join(CASES)}")
     add("--out", type=Path, default=Path("bench.json"), help="file to write (default: bench.json)")
-    add("--compare", type=Path, help="a file of the same options; ratios above 1 are slower than then")
-    add("--small", action="store_true", help="the start of the command and small renders alone")
     add("--before", metavar="PYTHON", help="a Python that has an earlier version, to take turns with")
     add("--turns", type=int, default=7, help="how often each side is measured (default: 7)")
-    add("--device", metavar="VARIANT", help="against Mitsuba's integrators in a variant, such as cuda_ad_rgb")
+    add("--variant", default="llvm_ad_rgb", help="of Mitsuba (default: llvm_ad_rgb)")
+    add("--measure", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args(arguments)
-    try:
-        before = read(given.compare) if given.compare else {}
-        prepare_folder(given.out.parent, given.out.name)
-        print(62 * " " + "".join(f"{column:>14}" for column in COLUMNS))
-        found = {}
-        for name, row in rows(given):
-            key = "ratio" if "ratio" in row else "seconds"
-            then = before.get(name, {}).get(key)
-            found[name] = row | ({"to then": row[key] / then} if then else {})
-            cells = (f"{found[name][c]:>14.4g}" if c in found[name] else 14 * " " for c in COLUMNS)
-            print(f"{name:<62}{''.join(cells)}".rstrip(), flush=True)
-    except UsageError as error:
-        parser.error(str(error))
-    except MrtError as error:
-        print(f"make bench: {error}", file=sys.stderr)
-        return error.exit_code
-    now = {"machine": machine(), "options": {"device": given.device, "turns": given.turns}, "rows": found}
-    with replacing(given.out) as (file,):
-        file.write(json.dumps(now, indent=2).encode() + b"\n")
+    names = given.cases or list(CASES)
+    if unknown := [name for name in names if name not in CASES]:
+        parser.error(f"unknown case {unknown[0]!r}: choose from {', '.join(CASES)}")
+    if given.measure:
+        mi.set_variant(given.variant)
+        mrt.register()
+        print(json.dumps({name: seconds(CASES[name]) for name in names}))
+        return 0
+    from mrt_mitsuba.validation.timing import in_turns, ratio_of
+
+    words = [__file__, "--measure", "--variant", given.variant, *names]
+    pythons = [sys.executable, given.before or sys.executable]
+    found, before = in_turns([partial(measured, [python, *words]) for python in pythons], given.turns)
+    rows = {}
+    for name in names:
+        rows[name] = ratio_of([run[name] for run in found], [run[name] for run in before])
+        print(f"{name:<20}" + "".join(f"  {key} {value:.4g}" for key, value in rows[name].items()))
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    given.out.write_text(json.dumps(rows, indent=2) + "\n")
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,13 +25,19 @@ Array = np.ndarray
 Picture = Any  # the path of an EXR, an array or the result of a render
 ORDER = "RGBXYZUVA"  # of channels within a layer, after others
 ROUNDING = 1e-5  # relative size of differences that are float32's: sums in another order, fused operations
-EPSILON = 0.01  # keeps black pixels, which no relative error describes, from ruling it
+EPSILON = 0.01  # keeps black pixels from dominating the relative error
 CELL = 16  # pixels, a side of the cells whose means are compared
 BLOCKS = 64  # at most, along a side of the picture, whose signs are changed at a time
 # changes of the signs, and how many of the largest results tell an exponential law
 FLIPS = 500
 TAIL = 25
-MEASURES = ("mae", "rmse", "rel_mse", "psnr", "largest", "flip", "p_value")
+CHEAP = ("mae", "rmse", "rel_mse", "psnr", "largest", "p_value")
+MEASURES = (*CHEAP[:-1], "flip", "p_value")
+# HDR-FLIP exposes from where the brightest value is tone-mapped (ACES) to 0.85 to where the median is
+FLIP_WHITE = 2.11887
+MAX_EXPOSURES = 16  # stops between the first and the last exposure
+FLIP_LARGEST = 1e10  # larger values are white in every exposure
+LUMINANCE = (0.2126, 0.7152, 0.0722)
 UNDEFINED = {  # why a measure may be None
     "flip": "FLIP needs three channels, finite and not negative, a reference that is not black, and the "
     "package flip-evaluator",
@@ -57,19 +64,29 @@ class Difference:
     def flip(self) -> float | None:
         """Mean of HDR-FLIP (Andersson et al. 2021), the difference that a viewer sees, from 0 to 1.
 
-        It takes its exposures from the reference. None where it is not defined.
+        Exposures are chosen from the reference. None where it is not defined. A megapixel takes a minute.
         """
-        a, b = (np.ascontiguousarray(picture, np.float32) for picture in self.pictures)
-        defined = a.shape[2] == 3 and all(np.isfinite(p).all() and (p >= 0).all() for p in (a, b)) and b.any()
-        if not defined or find_spec("flip_evaluator") is None:
+        a, b = self.pictures
+        if a.shape[2] != 3 or find_spec("flip_evaluator") is None or not b.any():
+            return None
+        if not all(np.isfinite(p).all() and (p >= 0).all() for p in self.pictures):
             return None
         import flip_evaluator
 
-        return float(flip_evaluator.evaluate(b, a, "HDR", applyMagma=False, parameters={})[1])
+        # Exposed here, since the package ends the process where its own choice of exposures fails
+        luminance = b @ np.array(LUMINANCE)
+        scale = FLIP_WHITE / luminance.max()
+        stops = np.log2(luminance.max() / max(np.median(luminance), luminance.max() / 2**MAX_EXPOSURES))
+        exposures = {"startExposure": 0.0, "stopExposure": float(stops)}
+        exposures["numExposures"] = max(2, math.ceil(stops))
+        test, reference = (np.minimum(p * scale, FLIP_LARGEST).astype(np.float32) for p in (a, b))
+        return float(
+            flip_evaluator.evaluate(reference, test, "HDR", applyMagma=False, parameters=exposures)[1]
+        )
 
-    def measures(self) -> dict[str, float | None]:
-        """All measures by name."""
-        return {name: getattr(self, name) for name in MEASURES}
+    def measures(self, names: Sequence[str] = MEASURES) -> dict[str, float | None]:
+        """Measures by name, by default all."""
+        return {name: getattr(self, name) for name in names}
 
     @needs_extra()
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -86,15 +103,19 @@ class Difference:
             check_target(f"{stem}.{ending}", self.inputs)
         values = self.difference
         shown = values if values.shape[2] == 3 else np.repeat(values[..., :1], 3, axis=2)
-        write_exr(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures().items()})
+        write_exr(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures(CHEAP).items()})
         size = abs(values).max(axis=2)
         scale = np.max(size, initial=0, where=np.isfinite(size)) or 1
         colors = colormaps["inferno"](size / scale)  # what is above 1 as 1
         write_png(f"{stem}.png", np.float32(colors[..., :3]))
 
-    def __str__(self) -> str:
-        lines = [f"{name:<8} {'-' if v is None else f'{v:.4g}'}" for name, v in self.measures().items()]
+    def text(self, names: Sequence[str] = MEASURES) -> str:
+        """A line for each of these measures, and one that says where the largest difference is."""
+        lines = [f"{name:<8} {'-' if v is None else f'{v:.4g}'}" for name, v in self.measures(names).items()]
         return "\n".join([*lines, f"the largest is at row {self.place[0]}, column {self.place[1]}"])
+
+    def __str__(self) -> str:
+        return self.text()
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(str(self))}</pre>"
@@ -167,7 +188,9 @@ def read_layer(source: Picture, layer: str = "", name: str = "the picture") -> L
     bad = np.argwhere(np.isnan(found[0]).any(axis=-1))
     if len(bad):
         place = f"row {bad[0][0]}, column {bad[0][1]}"
-        raise UsageError(f"{name} is NaN in {len(bad)} pixels, the first at {place}: mend it first")
+        raise UsageError(
+            f"{name} is NaN in {len(bad)} pixels, the first at {place}: replace NaNs before comparing"
+        )
     return found
 
 

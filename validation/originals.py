@@ -5,11 +5,18 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba.files.images import read_exr
+from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.validation import plotting
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EXACT = 24  # significant bits of a float32
 
@@ -55,3 +62,27 @@ def shortened(picture: np.ndarray, window: tuple[int, int, int, int], block: int
     part = part.reshape(height // block, block, width // block, block, -1).mean(axis=(1, 3))
     digits, exponent = np.frexp(part)
     return np.ldexp(np.round(digits * 2.0**bits), exponent - bits).astype(np.float32)
+
+
+def side_by_side(folder: str | os.PathLike[str]) -> tuple[Figure, list[dict[str, Any]]]:
+    """Draw scenes 0 to 4 by the original program, by ours, and their difference times 100.
+
+    Also return a row for each scene.
+    """
+    rows = []
+    drawn, plots = plotting.panels(5, 3, 7.2, 9.4)
+    for scene, row in enumerate(plots):
+        original = read_original(Path(folder) / f"s{scene}_none_aa4.exr")
+        result = mrt.render(original.scene, fresnel="dielectric", progress=Progress(), **original.options)
+        ours = original.like(result.image)
+        difference = np.abs(ours - original.image)
+        for axes, picture in zip(row, (original.image, ours, 100 * difference), strict=True):
+            plotting.show_picture(axes, picture)
+        row[0].set_ylabel(f"scene {scene}")
+        off = f"{(difference.max(axis=-1) > 1 / 255).mean():.2%}"
+        rows.append(
+            {"scene": scene, "mean difference": float(difference.mean()), "pixels off by > 1/255": off}
+        )
+    for axes, title in zip(plots[0], ("original", "ours", "|difference| × 100"), strict=True):
+        axes.set_title(title, loc="left")
+    return drawn, rows

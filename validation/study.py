@@ -15,11 +15,9 @@ import json
 import os
 import platform
 import re
-import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -176,75 +174,6 @@ def findings(part: Callable[..., None], **options: Any) -> Study:
     study = Study("", "")
     part(study, **options)
     return study
-
-
-# ------------------------------------------------ Timing -----------------------------------------------
-
-
-def timed(run: Callable[..., Item], *arguments: object) -> tuple[Item, float]:
-    """The result of a function, and its seconds."""
-    start = time.perf_counter()
-    result = run(*arguments)
-    return result, time.perf_counter() - start
-
-
-def in_turns(sides: Sequence[Callable[[int], Item]], turns: int) -> list[list[Item]]:
-    """The results of each side for the number of each turn, so that a load on the machine meets all.
-
-    The order changes from turn to turn.
-    """
-    results: list[list[Item]] = [[] for _ in sides]
-    for turn in range(turns):
-        both = list(zip(sides, results, strict=True))
-        for side, result in both if turn % 2 == 0 else reversed(both):
-            result.append(side(turn))
-    return results
-
-
-def ratio_of(seconds: Sequence[float], others: Sequence[float]) -> dict[str, float]:
-    """The median "ratio" of pairs of seconds, its quartiles "low" and "high", and both medians."""
-    low, middle, high = np.quantile(np.divide(seconds, others), (0.25, 0.5, 0.75)).tolist()
-    medians = {"seconds": float(np.median(seconds)), "other_seconds": float(np.median(others))}
-    return {"ratio": middle, "low": low, "high": high, **medians}
-
-
-def ratio(run: Run, other: Run, *, repeats: int) -> dict[str, float]:
-    """Compare two runs in turns, see ``ratio_of``. Both run once before, which compiles what there is."""
-
-    def seconds(side: Run, turn: int) -> float:
-        return timed(side)[1]
-
-    sides = [partial(seconds, side) for side in (run, other)]
-    in_turns(sides, 1)
-    return ratio_of(*in_turns(sides, repeats))
-
-
-def timed_in_turns(sides: Sequence[Callable[[int], Any]], turns: int) -> list[tuple[list[Any], np.ndarray]]:
-    """The results of each side, see ``in_turns``, and their seconds [turns].
-
-    Each side runs once before, which compiles its kernels.
-    """
-    in_turns(sides, 1)
-    runs = in_turns([partial(timed, side) for side in sides], turns)
-    return [([result for result, _ in run], np.array([seconds for _, seconds in run])) for run in runs]
-
-
-def kernel_records(render: Run) -> list[Mapping[str, Any]]:
-    """What Dr.Jit recorded of the kernels of a ``mrt.render``, in the order of their launches."""
-    found: list[Mapping[str, Any]] = []
-
-    class Watch(Progress):
-        def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
-            found.extend(records)
-
-    render(progress=Watch())
-    return found
-
-
-def operations(render: Run) -> list[int]:
-    """The length of the code of each distinct kernel of a ``mrt.render``."""
-    lengths = {r["hash"]: r["operation_count"] for r in kernel_records(render) if r.get("operation_count")}
-    return list(lengths.values())
 
 
 # ---------------------------------------------- The report ---------------------------------------------

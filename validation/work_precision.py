@@ -11,30 +11,36 @@ import math
 import os
 import re
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import MrtError, UsageError, needs_extra
+from mrt_mitsuba.errors import MrtError, MrtWarning, UsageError, needs_extra
 from mrt_mitsuba.options import is_path
 from mrt_mitsuba.rendering.api import Result, render
 from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation import plotting
 from mrt_mitsuba.validation.compare import Array, Difference, compare, read_layer
 from mrt_mitsuba.validation.study import Study, Values, notebook, save_report
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 TITLE = "Error against time"
-LEAST = 0.05  # seconds that one timing takes: a shorter render is repeated, and the mean counts
-REFERENCE_SEEDS = (2**20 + 1, 2**20 + 2)  # far from those of the repeats
+MIN_SECONDS = 0.05  # that one timing takes: a shorter render is repeated, and the mean counts
 RESOLVED = 2.0  # an error is known from this many times the reference's own error on
-ERRORS = 4  # that the time is given for, unless they are chosen
-NUMBER = r"=?[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?"
-NOTHING = 1e-15  # an RMSE of 0, as logarithms have it
+ERRORS = 4  # number of errors for which the time is given, unless they are chosen
+MAX_IMPROVEMENTS = 8  # of reference="auto": each doubles its rays
+NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?%?"
+MIN_RMSE = 1e-15  # a smaller one is 0, which has no logarithm
 LEVEL = 0.95  # of all intervals
 
 Options = Mapping[str, Any]
@@ -72,7 +78,7 @@ class Point:
         repeats = len(times)
         # The standard error of a median is at most √(π/2) times that of a mean
         slower = math.exp(math.sqrt(math.pi / 2) * _reach(np.log(times)))
-        mse = max(float(squares.mean()), NOTHING**2)
+        mse = max(float(squares.mean()), MIN_RMSE**2)
         rmse = math.sqrt(mse)
         worse = math.exp(min(_reach(squares) / mse / 2, 99))
         # Pairs of different repeats: their mean varies as twice that of what they have in common
@@ -85,7 +91,7 @@ class Point:
             name=name,
             seconds=seconds,
             seconds_interval=(seconds / slower, seconds * slower),
-            rmse=rmse if rmse > NOTHING else 0.0,
+            rmse=rmse if rmse > MIN_RMSE else 0.0,
             rmse_interval=(rmse / worse, rmse * worse),
             variance=variance,
             bias=bias,
@@ -97,7 +103,8 @@ class Point:
     @property
     def family(self) -> str:
         """The name without its numbers: cases that differ in these alone are one curve."""
-        return " ".join(re.sub(NUMBER, " ", self.name).split()) or self.name
+        words = " ".join(re.sub(rf"(?:\b\w+=)?{NUMBER}", " ", self.name).split())
+        return words.strip(" ,") or " ".join(re.sub(NUMBER, " ", self.name).split()) or self.name
 
     @property
     def resolved(self) -> bool:
@@ -116,7 +123,7 @@ class Point:
             "interval, s": interval(self.seconds_interval),
             "cold, s": self.cold,
             "of it compiling, s": self.compile,
-            "RMSE": self.rmse if self.resolved else "at the floor",
+            "RMSE": self.rmse if self.resolved else "not resolved",
             "interval": interval(self.rmse_interval) if self.resolved else "",
             "|bias|": self.bias,
             "interval of it": interval(self.bias_interval),
@@ -126,6 +133,55 @@ class Point:
             "FLIP": self.difference.flip,
             "rays": sum(self.rays.values()),
         }
+
+
+@dataclass(frozen=True)
+class Race:
+    """Which curves come down to an error, the fastest first, and when."""
+
+    error: float
+    times: Mapping[str, tuple[float, float, float]]  #: seconds and their interval, by curve
+    case: str  #: the fastest case of the first curve that comes so low
+
+    @property
+    def rivals(self) -> list[str]:
+        """Curves whose intervals overlap with that of the first one: then there is no winner."""
+        best, *others = self.times or [""]
+        return [name for name in others if not self.times[best][2] < self.times[name][1]]
+
+    @property
+    def longer(self) -> float:
+        """How many times as long as the first curve the next one takes."""
+        first, second = [seconds for seconds, *_ in self.times.values()][:2]
+        return second / first
+
+    def __str__(self) -> str:
+        best, *others = self.times or [""]
+        if not best:
+            verdict = "no case comes so low"
+        elif self.rivals:
+            verdict = f"no winner, for the intervals overlap: {', '.join([best, *self.rivals])}"
+        elif others:
+            longer = f"{self.longer:.2g} times as long"
+            verdict = f"{best} is the fastest, {_shown(*self.times[best])} s; {others[0]} takes {longer}"
+        else:
+            verdict = f"only {best} comes so low, in {_shown(*self.times[best])} s"
+        return f"RMSE of {self.error:g}: {verdict}."
+
+    def row(self) -> Values:
+        """The row of the table of what to use."""
+        best, *others = self.times or [""]
+        row: Values = {"to get to an error of": self.error, "use": self.case or "nothing comes so low"}
+        row |= {
+            "seconds": _shown(*self.times[best]) if best else None,
+            "next best": None,
+            "which takes": None,
+        }
+        if self.rivals:
+            row["use"] = f"no winner: {', '.join([best, *self.rivals])}"
+        elif others:
+            row |= {"next best": others[0], "which takes": f"{self.longer:.2g} times as long"}
+        return row
 
 
 @dataclass(frozen=True)
@@ -149,10 +205,21 @@ class Findings:
             groups[point.family].append(point)
         return groups
 
-    def time_to(self, error: float) -> dict[str, tuple[float, ...]]:
-        """When each curve comes down to an RMSE, in seconds with an interval; infinite if never.
+    @property
+    def warning(self) -> str:
+        """What the reference is too coarse for; "" if nothing."""
+        coarse = [point.name for point in self.points.values() if point.rmse > 0 and not point.resolved]
+        if not coarse:
+            return ""
+        return (
+            f"The reference is too coarse, its own RMSE is {self.reference_error:.2g}: nothing can be said "
+            f'about {", ".join(coarse)}; use more rays for it, or reference="auto".'
+        )
 
-        The interval is from where the lower ends of all intervals come so low to where the upper ends do.
+    def time_to(self, error: float) -> dict[str, tuple[float, float, float]]:
+        """Seconds of each curve to come down to an RMSE, with their interval; infinite where none do.
+
+        The ends of the interval are those of a curve that is as low, or as high, as its intervals allow.
         """
         times = {}
         for name, points in self.families.items():
@@ -161,50 +228,33 @@ class Findings:
             times[name] = tuple(_crossing(*curve, error) for curve in zip(seconds, errors, strict=True))
         return times
 
+    def race(self, error: float) -> Race:
+        """Which curves come down to an error, and when."""
+        times = {name: t for name, t in self.time_to(error).items() if math.isfinite(t[0])}
+        times = dict(sorted(times.items(), key=lambda item: item[1]))
+        case = ""
+        if times:
+            points = self.families[next(iter(times))]  # the fastest first
+            case = next(p.name for p in points if p.rmse <= error * (1 + 1e-9))
+        return Race(error, times, case)
+
     @property
     def verdicts(self) -> list[str]:
         """A sentence for each of ``errors``; it names a winner only if its interval meets no other."""
         if self.repeats < 2:
             return ["No verdict on time: a single repeat has no interval."]
-        sentences = []
-        for error in self.errors:
-            reached = {name: t for name, t in self.time_to(error).items() if math.isfinite(t[0])}
-            best, *others = sorted(reached, key=reached.__getitem__) or [""]
-            like = [name for name in others if not reached[best][2] < reached[name][1]]
-            if like:
-                verdict = f"no winner, for the intervals overlap: {', '.join([best, *like])}"
-            elif others:
-                longer = f"{reached[others[0]][0] / reached[best][0]:.2g} times as long"
-                verdict = f"{best} is the fastest, {_shown(*reached[best])} s; {others[0]} takes {longer}"
-            elif best:
-                verdict = f"only {best} comes so low, in {_shown(*reached[best])} s"
-            else:
-                verdict = "no case comes so low"
-            sentences.append(f"RMSE of {error:g}: {verdict}.")
-        return sentences
+        if self.points and not self.errors:
+            return ["No verdict on time: no case has an error that the reference can resolve."]
+        return [str(self.race(error)) for error in self.errors]
 
     def advice(self) -> list[Values]:
         """A row for each of ``errors``: the case that gets there first, and the next other curve."""
-        rows = []
-        fastest_first = sorted(self.points.values(), key=attrgetter("seconds"))
-        for error in self.errors:
-            low = [p for p in fastest_first if p.rmse <= error]
-            others = [p for p in low if p.family != low[0].family]
-            row: Values = {"to get to an error of": error, "use": "nothing comes so low"}
-            row |= {"seconds": None, "next best": None, "which takes": None}
-            if low:
-                row["use"] = low[0].name
-                row["seconds"] = _shown(low[0].seconds, *low[0].seconds_interval)
-            if others:
-                times = others[0].seconds / low[0].seconds
-                row["next best"] = others[0].name
-                row["which takes"] = f"{times:.2g} times as long" if times > 1.05 else "as long"
-            rows.append(row)
-        return rows
+        return [self.race(error).row() for error in self.errors]
 
     def __str__(self) -> str:
         width = max(map(len, [*self.points, *self.failed]), default=0)
-        lines = [
+        lines = [self.warning] if self.warning else []
+        lines += [
             f"{p.name:<{width}}  {_shown(p.seconds, *p.seconds_interval)} s, "
             f"RMSE {_shown(p.rmse, *p.rmse_interval)}"
             for p in self.points.values()
@@ -247,7 +297,7 @@ def _crossing(seconds: Array, errors: Array, error: float) -> float:
     down = errors < np.minimum.accumulate([math.inf, *errors[:-1]])
     if not down.any():  # NaN: a single repeat has no interval
         return math.nan
-    depths = -np.log(np.maximum(errors[down], NOTHING))
+    depths = -np.log(np.maximum(errors[down], MIN_RMSE))
     times = np.log(seconds[down])
     # an error that is met to rounding is met
     return float(np.exp(np.interp(-math.log(error * (1 + 1e-9)), depths, times, right=math.inf)))
@@ -259,7 +309,57 @@ def _shown(value: float, low: float, high: float) -> str:
     return f"{value:.3g}" if math.isnan(low) else f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
-# ---------------------------------------------- Measuring ----------------------------------------------
+# ----------------------------------------------- Reference -----------------------------------------------
+
+
+Truth = tuple[Array, Array, float]  # two independent halves, or twice the same picture; its own RMSE
+
+
+def _automatic(run: Run, cases: Mapping[str, Options], step: int) -> Truth:
+    """Render the scene by its own integrator, with more rays than the cases, doubled ``step`` times."""
+    spp = 2 * max(int(case.get("spp") or 16) for case in cases.values())
+    truth = _halves(run, {"aamode": "none", "target": None, "spp": spp * 2**step})
+    if truth[2]:
+        return truth
+    aa = 2 * max(int(case.get("aa") or 4) for case in cases.values()) * 2**step
+    lattice = {"aamode": "none", "lattice": "centered"}
+    return _difference(run, [{**lattice, "aa": aa}, {**lattice, "aa": aa * 3 // 4}])
+
+
+def _given(reference: Given, run: Run) -> Truth:
+    """Render or read a reference, see ``error_vs_time``."""
+    if isinstance(reference, Mapping):
+        truth = _halves(run, reference)
+        aa = run(reference, 0).options["aa"] if not truth[2] else 1
+        return truth if aa == 1 else _difference(run, [reference, {**reference, "aa": aa - 1}])
+    if isinstance(reference, Sequence) and not isinstance(reference, str):
+        return _difference(run, reference)
+    picture, variance, _ = read_layer(reference)
+    return picture, picture, 0.0 if variance is None else float(variance.mean()) ** 0.5
+
+
+def _halves(run: Run, options: Options) -> Truth:
+    """Render half of the rays twice, with other seeds."""
+    spp = int(options.get("spp") or 1)
+    half = {**options, "spp": spp // 2} if spp > 1 else options
+    first, second = (_picture(run(half, derived_seed(0, reference=part))) for part in (1, 2))
+    return first, second, compare(first, second).rmse / 2
+
+
+def _difference(run: Run, options: Sequence[Options]) -> Truth:
+    """Render the better options and others, whose difference bounds the error."""
+    first, second = (_picture(run(one, derived_seed(0, reference=1))) for one in options)
+    return first, first, compare(first, second).rmse
+
+
+def _picture(result: Result) -> Array:
+    bad = np.argwhere(~np.isfinite(result.image).all(axis=-1))
+    if len(bad):
+        raise MrtError(f"{len(bad)} pixels are NaN or infinite, the first at {tuple(bad[0].tolist())}")
+    return np.asarray(result.image, np.float64)
+
+
+# ----------------------------------------------- Measuring -----------------------------------------------
 
 
 @needs_extra()
@@ -267,7 +367,7 @@ def error_vs_time(
     scene: Given,
     cases: Mapping[str, Options],
     *,
-    reference: Given,
+    reference: Given = "auto",
     repeats: int = 5,
     shared: Options | None = None,
     errors: Sequence[float] | None = None,
@@ -280,19 +380,20 @@ def error_vs_time(
         scene: whatever ``render`` takes.
         cases: options of ``render`` by a name; names that differ in numbers only make one curve. A case may
             bring a ``scene`` of its own, of the same size.
-        reference: options that give the truth. Where something is random, it is rendered as two halves of
-            its ``spp``, with other seeds, and their difference is its own error; elsewhere a render with
-            ``aa`` less by one is compared. Two sets of options, the better first: what they differ by bounds
-            the error of the first. Or a picture: an array, the path of an EXR or a ``Result``, whose error is
-            read from its layer "error".
+        reference: "auto" renders the scene by its own integrator, with more and more rays until the error of
+            each case is at least twice the reference's own. Or options that give the truth: where something
+            is random, it is rendered as two halves of its ``spp``, with other seeds, and their difference is
+            its own error; elsewhere a render with ``aa`` less by one is compared. Two sets of options, the
+            better first: what they differ by bounds the error of the first. Or a picture: an array, the path
+            of an EXR or a ``Result``, whose error is read from its layer "error".
         repeats: with other seeds, in turn, after a cold and a warm run of each case. A render of less than
             0.05 s is timed as the mean of several.
         shared: options of all cases and of the reference.
         errors: RMSEs to give the time for; by default four over the range that was measured.
         cold: whether the kernels of each case are compiled anew for its first run, which takes longer.
 
-    A case that fails is kept, with the reason. Raises ``UsageError`` for wrong arguments, and what
-    ``render`` raises for the reference.
+    A case that fails is kept, with the reason. Warns where a reference is too coarse for a case. Raises
+    ``UsageError`` for wrong arguments, and what ``render`` raises for the reference.
     """
     start = time.perf_counter()
     shared = shared or {}
@@ -302,20 +403,26 @@ def error_vs_time(
         if "seed" in options:
             raise UsageError(f"{name} sets a seed: repeats have seeds of their own; leave it out")
     run = _runner(scene, shared)
-    *halves, own_error = _reference(reference, run)
-    for error in errors or ():
-        if not error > RESOLVED * own_error:
-            raise UsageError(
-                f"no claim can be made about an RMSE of {error:g}: the reference's own error is "
-                f"{own_error:.2g}, and only errors above twice that stand out; take a better reference"
-            )
+    automatic = isinstance(reference, str) and reference == "auto"
+    *halves, own_error = _automatic(run, cases, 0) if automatic else _given(reference, run)
+    needed = min(errors or (math.inf,)) / RESOLVED
+    if needed <= own_error and not automatic:
+        raise UsageError(
+            f"no claim can be made about an RMSE of {min(errors or ()):g}: the reference's own error is "
+            f"{own_error:.2g}, and only errors above twice that stand out; take a better reference"
+        )
     runs, failed = _measure(run, cases, halves[0], repeats, cold, progress or Progress())
-    points = {name: _point(name, found, repeats, halves, own_error) for name, found in runs.items()}
+    for step in range(1, MAX_IMPROVEMENTS + 1):
+        points = _points(runs, repeats, halves, own_error)
+        least = min((p.rmse for p in points.values() if p.rmse), default=math.inf)
+        if not automatic or own_error < min(needed, least / RESOLVED):
+            break
+        *halves, own_error = _automatic(run, cases, step)
     known = [p.rmse for p in points.values() if p.resolved and p.rmse > 1e-9]
     if errors is None and known:  # rounded up, so that there is a case that comes so low
         inside = np.geomspace(max(known), min(known), ERRORS + 2)[1:-1]
         errors = list(dict.fromkeys(float(f"{1.05 * e:.1e}") for e in inside))
-    return Findings(
+    found = Findings(
         scene=next((result.plan.scene for (result, _), *_ in runs.values()), "scene"),
         points=points,
         failed=failed,
@@ -325,61 +432,37 @@ def error_vs_time(
         errors=list(errors or ()),
         took=time.perf_counter() - start,
     )
+    if found.warning:
+        warnings.warn(found.warning, MrtWarning, stacklevel=2)
+    return found
 
 
 def _runner(scene: Given, shared: Options) -> Run:
-    """A function that renders cases, each scene loaded once where it can be."""
+    """Return a function that renders cases; it loads each scene once for each set of parameters."""
     variant = runtime.use(shared.get("variant"))
-    loaded = {}  # by the id of what a scene is loaded from, which the caller holds
+    loaded: dict[tuple[int, str], tuple[Any, Options]] = {}
 
     def run(options: Options, seed: int) -> Result:
-        given = {
-            "scene": scene,
-            "variant": variant,
-            "progress": Progress(),
-            **shared,
-            **options,
-            "seed": seed,
-        }
+        given = {"scene": scene, "variant": variant, "progress": Progress(), **shared, **options}
         one = given.pop("scene")
-        loadable = isinstance(one, dict) or is_path(one, ".xml")
-        if loadable and given["variant"] == variant and "params" not in given:
-            if id(one) not in loaded:
-                loaded[id(one)] = open_scene(one, integrator=given.get("integrator")).scene
-            one = loaded[id(one)]
-        return render(one, **given)
+        if (isinstance(one, dict) or is_path(one, ".xml")) and given["variant"] == variant:
+            params = given.pop("params", None)
+            key = id(one), repr(params)  # the caller holds the scene
+            if key not in loaded:
+                source = open_scene(one, integrator=given.get("integrator"), params=params)
+                focus = {"focaldist": source.focal_distance, "focalrange": source.focal_range}
+                loaded[key] = source.scene, focus if source.focal_distance is not None else {}
+            one, focus = loaded[key]
+            given = {**focus, **given}
+        return render(one, **given, seed=seed)
 
     return run
-
-
-def _reference(reference: Given, run: Run) -> tuple[Array, Array, float]:
-    """Two independent halves of the reference, or twice the same picture; and its own error."""
-    if isinstance(reference, Mapping):
-        spp = {"spp": int(reference["spp"]) // 2} if reference.get("spp", 1) > 1 else {}
-        results = [run({**reference, **spp}, seed) for seed in REFERENCE_SEEDS]
-        first, second = map(_picture, results)
-        aa = results[0].options["aa"]
-        if aa == 1 or (first != second).any():
-            return first, second, compare(first, second).rmse / 2
-        reference = reference, {**reference, "aa": aa - 1}
-    if isinstance(reference, Sequence) and not isinstance(reference, str):
-        first, second = (_picture(run(r, s)) for r, s in zip(reference, REFERENCE_SEEDS, strict=True))
-        return first, first, compare(first, second).rmse
-    picture, variance, _ = read_layer(reference)
-    return picture, picture, 0.0 if variance is None else float(variance.mean()) ** 0.5
-
-
-def _picture(result: Result) -> Array:
-    bad = np.argwhere(~np.isfinite(result.image).all(axis=-1))
-    if len(bad):
-        raise MrtError(f"{len(bad)} pixels are NaN or infinite, the first at {tuple(bad[0].tolist())}")
-    return np.asarray(result.image, np.float64)
 
 
 def _measure(
     run: Run, cases: Mapping[str, Options], truth: Array, repeats: int, cold: bool, progress: Progress
 ) -> tuple[dict[str, list[Timed]], dict[str, str]]:
-    """The results of cases, of which the last ``repeats`` count, and why others failed.
+    """Return the results of cases, the last ``repeats`` of which count, and why others failed.
 
     Each runs first, perhaps with its kernels compiled anew and once more, then ``repeats`` times in turn, so
     that a load on the machine meets all alike.
@@ -396,8 +479,8 @@ def _measure(
                     if cold and turn == first:
                         dr.flush_kernel_cache()
                     seconds: list[float] = []
-                    while not seconds or (turn >= 0 and sum(seconds) < LEAST):
-                        result = run(cases[name], max(turn, 0))
+                    while not seconds or (turn >= 0 and sum(seconds) < MIN_SECONDS):
+                        result = run(cases[name], derived_seed(0, repeat=max(turn, 0)))
                         seconds.append(result.timings.total - result.timings.load)
                     picture = _picture(result)
                     if turn == first:
@@ -410,30 +493,69 @@ def _measure(
     return runs, failed
 
 
-def _point(
-    name: str, runs: Sequence[Timed], repeats: int, halves: Sequence[Array], own_error: float
-) -> Point:
-    """The figures of a case; its first run was cold, its last ``repeats`` count."""
-    results, seconds = zip(*runs, strict=True)
-    counted = results[-repeats:]
-    image = counted[0].image
-    pictures = np.array([result.image for result in counted], np.float64)  # [repeats, H, W, 3]
-    errors = [(pictures - half).reshape(len(pictures), -1) for half in halves]
-    gram = errors[0] @ errors[1].T / errors[0].shape[1]
-    return Point.of(
-        name,
-        np.array(seconds[-repeats:]),
-        (gram + gram.T) / 2,
-        cold=seconds[0],
-        compile=results[0].timings.compile,
-        rays=dict(counted[0].rays),
-        image=image,
-        difference=compare(image, np.mean(halves, axis=0)),
-        reference_error=own_error,
-    )
+def _points(
+    runs: Mapping[str, Sequence[Timed]], repeats: int, halves: Sequence[Array], own_error: float
+) -> dict[str, Point]:
+    """Return the figures of cases, by name; their first run was cold, their last ``repeats`` count."""
+    points = {}
+    for name, timed in runs.items():
+        results, seconds = zip(*timed, strict=True)
+        counted = results[-repeats:]
+        pictures = np.array([result.image for result in counted], np.float64)  # [repeats, H, W, 3]
+        errors = [(pictures - half).reshape(len(pictures), -1) for half in halves]
+        gram = errors[0] @ errors[1].T / errors[0].shape[1]
+        points[name] = Point.of(
+            name,
+            np.array(seconds[-repeats:]),
+            (gram + gram.T) / 2,
+            cold=seconds[0],
+            compile=results[0].timings.compile,
+            rays=dict(counted[0].rays),
+            image=counted[0].image,
+            difference=compare(counted[0].image, np.mean(halves, axis=0)),
+            reference_error=own_error,
+        )
+    return points
 
 
 # ------------------------------------------------ The page ------------------------------------------------
+
+
+def frontier(points: Sequence[Point]) -> list[Point]:
+    """Return the points that no other one beats in both time and error, fastest first."""
+    best: list[Point] = []
+    for point in sorted(points, key=attrgetter("seconds", "rmse")):
+        if not best or point.rmse < best[-1].rmse:
+            best.append(point)
+    return [point for point in best if point.resolved or not point.reference_error]
+
+
+def diagram(title: str, found: Findings) -> Figure:
+    """Draw the error of each case over its seconds; down and to the left is better.
+
+    Curves that are the best at some error are coloured. Bars are intervals, the band at the bottom is the
+    reference's own error.
+    """
+    drawn, axes = plotting.panel(title, 5.0, 5.2)
+    plotting.logarithmic(axes, "seconds of a warm render", "error (RMSE, linear)")
+    points = list(found.points.values())
+    best = frontier(points)
+    bottom = 0.7 * min([e for e in (found.reference_error, *(p.rmse for p in points)) if e], default=1e-6)
+    axes.plot([p.seconds for p in best], [p.rmse for p in best], color="#ffd34d", linewidth=7, alpha=0.6)
+    colors = dict(zip(dict.fromkeys(p.family for p in best), plotting.COLORS, strict=False))
+    for marker, (family, curve) in zip(cycle("osD^vPXh"), found.families.items()):
+        at = np.array([(p.seconds, max(p.rmse, bottom)) for p in curve])  # [points, 2]
+        ends = np.array([(p.seconds_interval, p.rmse_interval) for p in curve])  # [points, 2, 2]
+        bars = np.nan_to_num(abs(ends - at[:, :, None])).transpose(1, 2, 0)
+        look: Any = {"marker": marker, "color": colors.get(family, plotting.GREY), "elinewidth": 0.8}
+        look |= {"linewidth": 1.6, "markersize": 5} if family in colors else {"alpha": 0.7, "markersize": 3}
+        axes.errorbar(*at.T, xerr=bars[0], yerr=bars[1], label=family, **look)
+    if found.reference_error:
+        label = "within the reference's own error"
+        axes.axhspan(bottom / 10, found.reference_error, color="0.9", zorder=0, label=label)
+    axes.set_ylim(bottom=0.8 * bottom)
+    plotting.legend(axes)
+    return drawn
 
 
 def describe(study: Study, found: Findings, name: str, title: str, truth: str = "") -> None:
@@ -446,24 +568,24 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
         study.records(f"{prefix}failed", f"{title}: cases that failed", reasons)
     if not found.points:
         return
-    own = f"about {found.reference_error:.2g}; no claim is made below twice that"
+    if found.warning:
+        study.texts.append(f"{title}. {found.warning}")
+    own = f"about {found.reference_error:.2g}" if found.reference_error else "not known"
     caption = (
         "Down and to the left is better. Yellow: the best at each error; grey: curves that are never the "
-        f"best. Bars: 95 % intervals. Reference: {truth or 'as given'}. Its own RMSE is "
-        f"{own if found.reference_error else 'not known'}. "
+        f"best. Bars: 95 % intervals. Reference: {truth or 'as given'}; its own RMSE is {own}. "
     )
     caption += " ".join(found.verdicts)
-    drawn = plotting.work_precision(title, found)
-    study.picture(f"{prefix}diagram", f"{title}: work and precision", drawn, caption)
+    study.picture(f"{prefix}diagram", title, diagram(title, found), caption)
     if found.errors:
         study.records(f"{prefix}advice", f"{title}: what to use", found.advice(), first=not name)
-        reached = {f"RMSE {error:g}": found.time_to(error) for error in found.errors}
-        times = [
-            {"curve": curve} | {what: _shown(*t[curve]) for what, t in reached.items()}
+        times = {f"RMSE {error:g}": found.time_to(error) for error in found.errors}
+        rows = [
+            {"curve": curve} | {what: _shown(*t[curve]) for what, t in times.items()}
             for curve in found.families
         ]
         note = "With 95 % intervals. Between cases, curves are straight in logarithms; beyond, unknown."
-        study.records(f"{prefix}times", f"{title}: seconds to an error", times, note, first=not name)
+        study.records(f"{prefix}times", f"{title}: seconds to an error", rows, note)
     note = "Medians of warm renders without loading the scene; cold: a first run. Errors in linear light."
     points = [point.row() for curve in found.families.values() for point in curve]
     study.records(f"{prefix}points", f"{title}: every case", points, note)

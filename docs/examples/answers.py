@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,12 @@ import numpy as np
 
 import pages
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation import figures
+from mrt_mitsuba.validation import originals, plotting, work_precision
+from mrt_mitsuba.validation.studies import error_vs_time, honest, needs
+from mrt_mitsuba.validation.studies.stability import axes
+from mrt_mitsuba.validation.study import Study, findings
+
+Rows = list[dict[str, Any]]
 
 
 class Answer(NamedTuple):
@@ -29,12 +33,12 @@ class Answer(NamedTuple):
 
 def answer(
     sentence: str,
-    drawn: figures.Drawn,
+    plots: Sequence[Any],
+    rows: Rows,
     columns: dict[str, str] | None = None,
     width: str = "18rem",
 ) -> Answer:
     """An answer; ``columns``: headings, and the names of rows below them."""
-    plots, rows = drawn
     if columns:
         rows = [
             {head: row[name] for head, name in columns.items()}
@@ -50,47 +54,26 @@ def answer(
 def error_against_time() -> Answer:
     """All that a user can choose, in the report's scenes and Mitsuba's."""
     scenes = (0,) if pages.QUICK else (0, 1, 2, 3, 4, "Cornell box")
-    plots, rows = figures.error_against_time(*scenes, quick=pages.QUICK)
-    best = Counter(_kind(row["use"]) for row in rows)
-    shown = []
-    title = ""
-    for row in rows:
-        shown.append(row | {"in": row["in"] if row["in"] != title else ""})
-        title = row["in"]
-    counts = [
-        f"{kind} ({count})"
-        for kind, count in best.most_common()
-        if kind != "nothing"
-    ]
+    panels: dict[str, work_precision.Findings] = {}
+    for scene in scenes:
+        cost = error_vs_time.QUICK if pages.QUICK else error_vs_time.shown(scene)
+        panels |= error_vs_time.choices(scene, cost)
+    plots = [work_precision.diagram(title, found) for title, found in panels.items()]
+    rows = error_vs_time.advice(panels)
+    decided = sum(row["next best"] is not None for row in rows)
     return answer(
-        f"The fastest ways to the {len(rows)} errors below: "
-        f"{', '.join(counts)}.",
-        (plots, shown),
+        f"In {decided} of these {len(rows)} comparisons, one way is the "
+        "fastest to the error in the table; in the others, intervals overlap.",
+        plots,
+        rows,
     )
-
-
-def _kind(case: str) -> str:
-    """The kind of settings that a case of ``error_against_time`` has."""
-    name = case.split()[0].split("=")[0]
-    if case.endswith("report"):
-        return "the report's lattice"
-    return {
-        "luma": "centred rays at edges",
-        "sobel": "centred rays at edges",
-        "geometry": "centred rays at edges",
-        "none": "centred rays in every pixel",
-        "independent": "paths with independent rays",
-        "aamode": "rays sent where the noise is",
-        "target": "rays sent where the noise is",
-        "nothing": "nothing",
-    }.get(name, "paths with stratified samplers")
 
 
 def hard_axes() -> Answer:
     """Where float32 breaks formulas."""
     mrt.register()
-    drawn = figures.hard_axes(quick=pages.QUICK)
-    rows = drawn[1]
+    found = findings(axes.show, quick=True, places=3 if pages.QUICK else 21)
+    plots, rows = _shown(found, "roundings")
     ours = max(_worst(rows, "ours"))
     theirs = sum(figure > 1000 for figure in _worst(rows, "Mitsuba"))
     first = sum(figure > 1000 for figure in _worst(rows, "as first written"))
@@ -99,7 +82,8 @@ def hard_axes() -> Answer:
         f"{first} of these {len(rows)} axes, the formula as one would write "
         "it first loses three digits or more, and so does Mitsuba's nearest "
         f"plugin along {theirs}.",
-        drawn,
+        plots,
+        rows,
         {
             "what": "what",
             "along": "along",
@@ -112,13 +96,26 @@ def hard_axes() -> Answer:
     )
 
 
+def _shown(study: Study, name: str) -> tuple[list[Any], Rows]:
+    """The plots of a study, and the rows of one of its tables."""
+    table = study.tables[name]
+    rows = [
+        dict(zip(table["columns"], row, strict=True)) for row in table["rows"]
+    ]
+    return [image["content"] for image in study.images.values()], rows
+
+
 def _worst(rows: Sequence[dict[str, Any]], name: str) -> list[float]:
     return [row[f"{name}, worst"] for row in rows]
 
 
 def left_out() -> Answer:
     """What scenes would cost if nothing were left out."""
-    plots, rows = figures.left_out(quick=pages.QUICK)
+    scenes, repeats = ((3,), 1) if pages.QUICK else (needs.SCENES, 3)
+    found = findings(
+        needs.show, size=(160, 120), scenes=scenes, repeats=repeats
+    )
+    plots, rows = _shown(found, "savings")
     rays, size, time = (
         max(row[f"{name}: times as many"] for row in rows)
         for name in ("rays", "operations", "seconds")
@@ -127,7 +124,8 @@ def left_out() -> Answer:
         f"What a scene does not need would cost it up to {rays:.1f} times "
         f"the rays, a kernel {size:.1f} times as large, and {time:.1f} times "
         "the time.",
-        (plots, _dots({row["scene"]: row["left out"] for row in rows})),
+        plots,
+        _dots({row["scene"]: row["left out"] for row in rows}),
     )
 
 
@@ -153,11 +151,12 @@ def _dots(left_out: dict[int, str]) -> list[dict[str, str]]:
 
 def original() -> Answer:
     """Scenes by the original program, by ours, and their difference."""
-    drawn = figures.beside_the_original(pages.ORIGINALS)
-    assert max(row["mean difference"] for row in drawn[1]) < 3e-4
+    drawn, rows = originals.side_by_side(pages.ORIGINALS)
+    assert max(row["mean difference"] for row in rows) < 3e-4
     return answer(
         "On average, our pictures are within 3e-4 of the original's.",
-        drawn,
+        [drawn],
+        rows,
         width="40rem",
     )
 
@@ -224,7 +223,5 @@ def own_scene(result: mrt.Result) -> pages.Html:
     side = 48 if pages.QUICK else 96
     box["sensor"]["film"] |= {"width": side, "height": side}
     few = {"seeds": 2, "truth_spp": 64} if pages.QUICK else {}
-    honest = figures.stated_and_true(
-        {"Cornell box": mi.load_dict(box)}, **few
-    )
-    return pages.plots(*figures.maps(result), honest)
+    calibration = honest.stated_and_true(mi.load_dict(box), **few)
+    return pages.plots(*plotting.maps(result), calibration)

@@ -23,7 +23,8 @@ import mrt_mitsuba as mrt  # first: it chooses the LLVM library
 import mitsuba as mi
 
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.validation import figures, plotting
+from mrt_mitsuba.validation import plotting, work_precision
+from mrt_mitsuba.validation.studies import error_vs_time
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,21 +99,24 @@ def equal_time(quick: bool) -> Image.Image:
         image, took = theirs(spp, seed)
         spp = max(round(spp * seconds / took), 1)
     truth = np.mean([theirs(truth_spp // 8, 100 + k)[0] for k in range(8)], axis=0)
-    drawn, plots = plotting.figure(1, 4, 10.4, 3.3)
+    drawn, plots = plotting.panels(1, 4, 10.4, 3.3)
     for axes, name, picture in zip(plots[0], ("mi.render", "ours"), (image, result.image), strict=False):
-        figures.show_picture(axes, picture, "srgb")
+        plotting.show_picture(axes, picture, "srgb")
         rmse = np.sqrt(np.square(picture - truth).mean())
-        axes.set_title(f"{name}: {seconds:.2f} s, error {rmse:.3f}", loc="left", **plotting.WORDS)
-    for axes, title, layer in zip(plots[0, 2:], figures.MAPS.values(), figures.MAPS, strict=True):
-        figures.show_map(axes, result.layers[layer])
-        axes.set_title(title, loc="left", **plotting.WORDS)
+        axes.set_title(f"{name}: {seconds:.2f} s, error {rmse:.3f}", loc="left")
+    for axes, title, layer in zip(plots[0, 2:], plotting.MAPS.values(), plotting.MAPS, strict=True):
+        plotting.show_map(axes, result.layers[layer])
+        axes.set_title(title, loc="left")
     return rasterized(drawn)
 
 
 def error_against_time(quick: bool) -> Image.Image:
     """What an error costs in time in scene 3 by the report's rays, and in the Cornell box by paths."""
-    drawn, _ = figures.error_against_time(3, "Cornell box", quick=quick)
-    panels = [np.asarray(rasterized(figure)) for figure in drawn[:1] + drawn[-1:]]
+    panels = []
+    for scene in (3, error_vs_time.BOX):
+        cost = error_vs_time.QUICK if quick else error_vs_time.shown(scene)
+        for title, found in error_vs_time.choices(scene, cost).items():
+            panels.append(np.asarray(rasterized(work_precision.diagram(title, found))))
     return Image.fromarray(np.hstack(panels))
 
 

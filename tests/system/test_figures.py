@@ -14,7 +14,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.validation import figures, plotting
 from mrt_mitsuba.validation.compare import compare
 from mrt_mitsuba.validation.studies import error_vs_time, needs
-from mrt_mitsuba.validation.studies.stability import curves
+from mrt_mitsuba.validation.studies.stability import axes as curves
 from mrt_mitsuba.validation.study import findings
 from mrt_mitsuba.validation.work_precision import Findings, Point
 

@@ -19,7 +19,8 @@ from scipy.stats import gmean
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.compare import Array, averaged, compare
 from mrt_mitsuba.validation.scenery import KINDS, LOCAL, SCENES, load, load_kind
-from mrt_mitsuba.validation.study import Study, Values, kernel_records, timed_in_turns
+from mrt_mitsuba.validation.study import Study, Values
+from mrt_mitsuba.validation.timing import kernel_records, timed_in_turns
 
 TITLE = "The cost of an error, against the best sampler"
 SAMPLERS = ("independent", "stratified", "multijitter", "ldsampler")

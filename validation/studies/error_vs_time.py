@@ -14,7 +14,6 @@ from mrt_mitsuba.validation.work_precision import Findings, describe, error_vs_t
 
 TITLE = "Error against run time"
 
-MODES = ("none", "luma", "sobel", "geometry")
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 PROMISED = 1 / 16 / 255  # a sixteenth of a step of an 8-bit picture
 CUT_OFFS = (0.0, PROMISED, 1 / 255, 4 / 255, 16 / 255)
@@ -126,36 +125,39 @@ def choices(number: Number, cost: Cost) -> dict[str, Findings]:
     """Measure everything that a user can choose in a scene, by a title for each of the two truths.
 
     ``mrt_whitted`` and ``path`` converge to pictures of their own. The Cornell box has paths alone; scenes
-    whose highlights are so narrow that rare paths rule the error have none.
+    whose highlights are so narrow that rare paths dominate the error have none.
     """
     titles = {}
     if number != BOX:
-        titles["sampling"] = "rays as in the report (mrt_whitted)"
+        titles["sampling"] = "rays as in the report"
     if number == BOX or number in CALM:
-        titles["path"] = "light paths (path)"
+        titles["path"] = "light paths"
     return {
-        f"{title_of(number)}: {title}": TRADES[name](number, cost).measure(cost)
+        f"{title_of(number)}, {title}": TRADES[name](number, cost).measure(cost)
         for name, title in titles.items()
     }
 
 
 def advice(panels: Mapping[str, Findings]) -> list[Values]:
-    """Rows that name the settings to use to get to an error, for each title of ``choices``."""
-    return [{"in": title, **row} for title, found in panels.items() for row in found.advice()]
+    """Return a row for each title of ``choices``: the settings to use to get to one error, in the middle."""
+    rows = []
+    for title, found in panels.items():
+        rows += [{"in": title, **row} for row in found.advice()[len(found.errors) // 2 :][:1]]
+    return rows
 
 
 def title_of(number: Number) -> str:
-    """A scene's name."""
+    """Return a scene's name."""
     return f"Scene {number}" if isinstance(number, int) else number
 
 
 def rmse(found: Findings, case: str) -> float:
-    """The error of a case."""
+    """Return the error of a case."""
     return found.points[case].rmse
 
 
 def judged(found: Findings, case: str) -> Limit:
-    """The limit of the reference's error, by the case of least error."""
+    """Return the limit of the reference's error, by the case of least error."""
     why = "then it changes no error by more than an eighth, and the judge is better than the judged"
     share = found.reference_error / rmse(found, case)
     return "error of the reference / least error it judges", share, 0.5, why
@@ -172,25 +174,33 @@ def _scene(number: Number, size: tuple[int, int], **options: Any) -> Values:
 
 
 def _rounds(cost: Cost, **options: Any) -> dict[str, Values]:
-    """Renders whose rays go where the noise is, of a number of rays or to an error."""
+    """Return adaptive renders, of a number of rays or to an error."""
     own = {"aa": None, "lattice": None, **options}
     most = 4 * max(cost.rounds, default=1)
-    cases = {f"aamode=noise spp={spp}": {**own, "aamode": "noise", "spp": spp} for spp in cost.rounds}
-    aims = {f"target={aim}": {**own, "aamode": None, "target": aim, "maxspp": most} for aim in cost.targets}
-    return cases | aims
+    cases = {f"adaptive, {spp} rays": {**own, "aamode": "noise", "spp": spp} for spp in cost.rounds}
+    aims = {f"adaptive, target {aim}": {**own, "aamode": None, "target": aim} for aim in cost.targets}
+    return cases | {name: {**case, "maxspp": most} for name, case in aims.items()}
+
+
+MODES = {"none": "every pixel", "luma": "luma edges", "sobel": "Sobel edges", "geometry": "geometry edges"}
+LATTICES = {"report": "report's lattice", "centered": "centred"}
 
 
 def sampling(number: int, cost: Cost) -> Trade:
     """Compare the modes of anti-aliasing, numbers of samples and lattices."""
+
+    def name(lattice: str, mode: str, aa: int) -> str:
+        return f"{LATTICES[lattice]}, {MODES[mode]}, aa={aa}"
+
     least = cost.amounts[0]
     greatest = cost.amounts[-1]
-    few = f"none aa={least} centered"
-    many = f"none aa={greatest} centered"
-    edges = f"sobel aa={greatest} centered"
+    few = name("centered", "none", least)
+    many = name("centered", "none", greatest)
+    edges = name("centered", "sobel", greatest)
     why = "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1"
     cases = {
-        f"{mode} aa={aa} {lattice}": {"aa": aa, "aamode": mode, "lattice": lattice, "focaldist": 0}
-        for lattice in ("report", "centered")
+        name(lattice, mode, aa): {"aa": aa, "aamode": mode, "lattice": lattice, "focaldist": 0}
+        for lattice in LATTICES
         for mode in MODES
         for aa in cost.amounts
         if mode == "none" or (aa > 1 and lattice in cost.lattices)
@@ -201,15 +211,13 @@ def sampling(number: int, cost: Cost) -> Trade:
         gains = [(f"RMSE of {case} / {few}", rmse(found, case) / rmse(found, few)) for case in (many, edges)]
         return [*((what, gain, worst, why) for what, gain in gains), judged(found, many)]
 
+    truth = {"aamode": "none", "lattice": "centered", "focaldist": 0}
     return Trade(
         title="anti-aliasing mode, aa and lattice",
         truth=f"{cost.most}x{cost.most} centered samples a pixel; its error: that of three quarters of them",
         scene=_scene(number, cost.size),
         cases=cases | _rounds(cost, focaldist=0),
-        reference=[
-            {"aa": aa, "aamode": "none", "lattice": "centered", "focaldist": 0}
-            for aa in (cost.most, cost.most * 3 // 4)
-        ],
+        reference=[{**truth, "aa": aa} for aa in (cost.most, cost.most * 3 // 4)],
         limits=limits,
     )
 
@@ -252,18 +260,18 @@ def path(number: Number, cost: Cost) -> Trade:
     nodes = _scene(number, cost.path_size)
     calm = number in CALM
     kinds = ("path", "direct") if calm else ("path",)
-    cases = {f"{kind} spp={spp}": {"integrator": kind, "spp": spp} for kind in kinds for spp in cost.counts}
+    cases = {f"{kind}, {spp} rays": {"integrator": kind, "spp": spp} for kind in kinds for spp in cost.counts}
     for sampler in cost.samplers:
         sensor = nodes["sensor"] | {"sampler": {"type": sampler}}
         own = {"scene": nodes | {"sensor": sensor}, "integrator": "path"}
-        cases |= {f"{sampler} spp={spp}": {**own, "spp": spp} for spp in cost.sampler_counts}
+        cases |= {f"{sampler} sampler, {spp} rays": {**own, "spp": spp} for spp in cost.sampler_counts}
     if calm and cost.counts:
         cases["mrt_whitted"] = {}
         cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
 
     def limits(found: Findings) -> list[Limit]:
-        few = f"path spp={cost.counts[0]}"
-        many = f"path spp={cost.counts[-1]}"
+        few = f"path, {cost.counts[0]} rays"
+        many = f"path, {cost.counts[-1]} rays"
         gain = (cost.counts[-1] / cost.counts[0]) ** 0.5
         off = abs(rmse(found, many) / rmse(found, few) * gain - 1)
         why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
@@ -282,6 +290,6 @@ def path(number: Number, cost: Cost) -> Trade:
 
 TRADES: dict[str, Callable[[Any, Cost], Trade]] = {"sampling": sampling, "whitted": whitted, "path": path}
 ALL = (0, 1, 2, 3, 4, 7, 9)
-# Under path, scenes of broad highlights: elsewhere rare, very bright paths rule every mean square
+# Under path, scenes of broad highlights: elsewhere rare, very bright paths dominate every mean square
 CALM = (0, 7, 9)
 SCENES: dict[str, tuple[Number, ...]] = {"sampling": ALL, "whitted": ALL, "path": (*ALL, BOX)}

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
 from scipy import stats
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.validation import plotting
 from mrt_mitsuba.validation.compare import Array, averaged
 from mrt_mitsuba.validation.scenery import load_room
 from mrt_mitsuba.validation.study import Study
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TITLE = "Errors that can be trusted"
 SIZE, SPP = 48, 64
@@ -107,3 +112,32 @@ def by_tenths(stated: Array, true: Array) -> tuple[Array, Array]:
         return np.sqrt(np.maximum(means, 1e-12))
 
     return errors(stated), errors(true)
+
+
+def tenths(scene: Any, *, seeds: int, truth_spp: int, spp: int = 64) -> tuple[Array, Array]:
+    """Return the stated and the true error of tenths of the pixels [10], sorted by the stated one.
+
+    Of renders by ``path`` with a mean of ``spp`` rays a pixel, allocated by variance, one for each seed. The
+    noise of the truth is subtracted from its squares.
+    """
+    path = mi.load_dict({"type": "path"})
+    parts = [mi.render(scene, integrator=path, spp=truth_spp // 8, seed=1000 + k) for k in range(8)]
+    truth, noise = averaged(parts)
+    options: dict[str, Any] = {"integrator": "path", "aamode": "noise", "spp": spp, "progress": Progress()}
+    results = [mrt.render(scene, seed=seed, **options) for seed in range(seeds)]
+    stated = np.square([result.layers["error.Y"] for result in results])
+    true = np.square([result.image for result in results] - truth).mean(axis=-1) - noise
+    return by_tenths(stated, true)
+
+
+def stated_and_true(scene: Any, *, seeds: int = 8, truth_spp: int = 2048) -> Figure:
+    """Plot the true over the stated error of tenths of the pixels of a loaded scene."""
+    stated, true = tenths(scene, seeds=seeds, truth_spp=truth_spp)
+    drawn, axes = plotting.panel("tenths of the pixels, by stated error")
+    plotting.logarithmic(axes, "stated error", "true error")
+    span = np.array([min(stated.min(), true.min()) / 1.3, max(stated.max(), true.max()) * 1.3])
+    axes.fill_between(span, span / 3, span * 3, color="0.93", label="within a factor of 3")
+    axes.plot(span, span, color="black", linewidth=0.8)
+    axes.plot(stated, true, marker="o", markersize=4, color=plotting.COLORS[0])
+    plotting.legend(axes)
+    return drawn

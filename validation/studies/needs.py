@@ -19,7 +19,8 @@ from mrt_mitsuba.files import LAYERS
 from mrt_mitsuba.rendering.api import Result
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation import plotting
-from mrt_mitsuba.validation.study import Study, Values, operations, timed_in_turns
+from mrt_mitsuba.validation.study import Study, Values
+from mrt_mitsuba.validation.timing import operations, timed_in_turns
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -113,8 +114,8 @@ def show(study: Study, size: tuple[int, int], scenes: Sequence[int], repeats: in
             times_as_many = row[f"{name}: times as many"]
             study.at_least(f"scene {number}: {name} without a plan / with it", times_as_many, 1, why)
     caption = (
-        "Blue: as planned, with the figure itself on it. Orange: where nothing is left out: all code in "
-        "the kernels, all layers, and (but for launches) as many rays in every pixel as edges get."
+        "Blue: as planned, with the figure itself on the left. Orange: where nothing is left out: all code "
+        "in the kernels, all layers, and (but for launches) as many rays in every pixel as edges get."
     )
     for name, title in TITLES.items():
         study.picture(f"savings {name}", title, savings(name, rows), caption if name == "rays" else "")
@@ -126,27 +127,14 @@ def savings(name: str, rows: Sequence[Values]) -> Figure:
     """Draw how many times as much of a measure scenes cost where nothing is left out, a bar for each row."""
     from matplotlib.ticker import EngFormatter
 
+    quantity = EngFormatter("s" if name == "seconds" else "", places=1)
+    drawn, axes = plotting.panel(TITLES[name], height=0.3 * len(rows) + 1)
     times = np.array([row[f"{name}: times as many"] for row in rows])
-    most = max(times.max(), 1.2)
-    places = np.arange(len(rows))
-    quantity = EngFormatter("s" if name == "seconds" else "")
-    drawn, axes = plotting.panel(TITLES[name], 4.6, 0.3 * len(rows) + 1)
-    bars = axes.barh(places, np.maximum(times, 1), height=0.7, color="#f2b98f")
-    axes.bar_label(
-        bars,
-        [f"× {factor:.2f}" for factor in times],
-        padding=3,
-        color=plotting.TEXT,
-        fontsize=plotting.LABELS,
-    )
-    axes.barh(places, np.ones(len(rows)), height=0.7, color=plotting.COLORS[0])
-    for place, row in enumerate(rows):
-        own = quantity(float(f"{row[name]:.3g}"))
-        axes.text(0.02 * most, place, own, color="white", va="center", fontsize=plotting.LABELS)
-    axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(0, 1.25 * most))
-    axes.set_yticks(places, [f"scene {row['scene']}" for row in rows])
-    axes.tick_params(axis="y", length=0)
-    axes.set_xlabel("times as much as planned", **plotting.WORDS)
-    axes.spines["left"].set_visible(False)
-    axes.axvline(1, color=plotting.TEXT, linewidth=0.6)
+    labels = [f"scene {row['scene']}: {quantity(row[name])}" for row in rows]
+    axes.invert_yaxis()
+    bars = axes.barh(labels, times, color="#f2b98f")
+    axes.bar_label(bars, [f"× {factor:.2f}" for factor in times], padding=3, fontsize=plotting.FONT)
+    axes.barh(labels, np.minimum(times, 1), color=plotting.COLORS[0])
+    axes.margins(x=0.2)
+    axes.set_xlabel("times as much as planned", fontsize=plotting.FONT)
     return drawn

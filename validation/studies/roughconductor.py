@@ -22,7 +22,8 @@ from mrt_mitsuba.validation.compare import compare, p_values
 from mrt_mitsuba.validation.laws.probe import is_scalar
 from mrt_mitsuba.validation.oracles.reference import smith_g1
 from mrt_mitsuba.validation.scenery import ball_scene
-from mrt_mitsuba.validation.study import Study, Values, timed_in_turns
+from mrt_mitsuba.validation.study import Study, Values
+from mrt_mitsuba.validation.timing import timed_in_turns
 
 TITLE = "The BSDF against Mitsuba's roughconductor"
 

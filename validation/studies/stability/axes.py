@@ -13,24 +13,20 @@ import numpy as np
 from numpy.linalg import norm
 
 from mrt_mitsuba.plugins import fresnel
-from mrt_mitsuba.scene.model import Cone, Cylinder, Plane, Sphere
+from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.validation import plotting
 from mrt_mitsuba.validation.bsdf_probe import evaluate, pairs_about
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.oracles.reference import Array, dot, smith_g1, unit
+from mrt_mitsuba.validation.oracles.reference import Array, dot, nearest, smith_g1, unit
 from mrt_mitsuba.validation.studies import roughconductor
-from mrt_mitsuba.validation.studies.stability.geometry import (
-    MIRROR,
-    ROUNDING,
-    ends,
-    first_hits,
-    lit,
-    trace_of,
-)
 from mrt_mitsuba.validation.study import Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+ROUNDING = 2.0**-24
+MIRROR = Material(1.5, 1.0, (1, 1, 1), (1, 1, 1))
+TIP = 0.2, 1.0, -0.4  # direction of slanted axes
 
 OURS = "ours"
 THEIRS = "Mitsuba"
@@ -73,7 +69,7 @@ def show(study: Study, *, quick: bool, places: int = 0) -> None:
     rows = []
     caption = (
         "Roundings of float32 (6e-8). Blue: ours. Orange: what of Mitsuba's comes nearest. Grey, dashed: the "
-        "formula as one would write it first. Dotted: the limit promised for ours."
+        "formula as one would write it first. At the top, no digit is right."
     )
     for number, axis in enumerate(study.each("Axes", AXES)):
         x, lines = curves(axis, places=places or (9 if quick else 33), count=24 if quick else 96)
@@ -100,26 +96,15 @@ def show(study: Study, *, quick: bool, places: int = 0) -> None:
 
 def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
     """Draw errors in roundings of float32 along an axis; all axes have the same scale."""
-    drawn, axes = plotting.panel(axis.title, 4.6, 3.2)
+    drawn, axes = plotting.panel(axis.title, height=3.4)
     blue, orange, *_ = plotting.COLORS
-    axes.axhspan(0.1, axis.limit, color="#dcebf7", zorder=0)
-    axes.axhline(axis.limit, color=blue, linestyle=":", linewidth=1)
-    axes.plot(x, lines[FIRST], color=plotting.GREY, linestyle=(0, (4, 2)), linewidth=1.4)
-    axes.plot(x, lines[THEIRS], color=orange, linewidth=1.4)
-    axes.plot(x, lines[OURS], color=blue, linewidth=2.4)
-    axes.set(xscale="log", yscale="log", ylim=(0.2, 10 * NONE_RIGHT))
-    plotting.powers_of_ten(axes.xaxis, axes.yaxis)
-    axes.set_xlabel(axis.label, **plotting.WORDS)
-    axes.set_ylabel("error in roundings", **plotting.WORDS)
-    axes.grid(alpha=0.2)
-    plotting.note(axes, 0.5, 0.9, "no digit is right", va="bottom", ha="center")
-    ends = {
-        FIRST: (x[-1], lines[FIRST][-1], plotting.GREY),
-        axis.nearest: (x[-1], lines[THEIRS][-1], orange),
-        OURS: (x[-1], lines[OURS][-1], blue),
-        "promised": (x[-1], axis.limit, blue),
-    }
-    plotting.label_ends(axes, ends)
+    plotting.logarithmic(axes, axis.label, "error in roundings")
+    axes.axhspan(0.1, axis.limit, color="#dcebf7", zorder=0, label="promised")
+    axes.plot(x, lines[FIRST], color=plotting.GREY, linestyle="--", label=FIRST)
+    axes.plot(x, lines[THEIRS], color=orange, label=axis.nearest)
+    axes.plot(x, lines[OURS], color=blue, linewidth=2.4, label=OURS)
+    axes.set_ylim(0.2, 10 * NONE_RIGHT)
+    plotting.legend(axes)
     return drawn
 
 
@@ -199,11 +184,17 @@ def _hits(
     for: there it sees our mesh.
     """
     o, d = rays
-    scene = mi.load_dict(lit(f"{type(thing).__name__.lower()}s", thing, (9e6, 9e6, 9e6)))
+    things = {f"{type(thing).__name__.lower()}s": (thing,)}
+    light = Light((9e6, 9e6, 9e6), (1, 1, 1))
+    lit = Scene(Camera((0, 0, 9), (0, 0, 0)), (0, 0, 0), (light,), **things)
+    scene = mi.load_dict(lit.to_dict(fresnel="unity"))
+    whitted = mi.load_dict({"type": "mrt_whitted", "min_contribution": 0.0})
     other = mi.load_dict({"type": "scene", "shape": stock}) if stock else scene
-    ours = np.array(trace_of(scene, o, d).hit.si.t)
+    ours = np.array(whitted.trace(scene, None, mi.Ray3f(o.T, d.T)).hit.si.t)
     theirs = np.array(other.ray_intersect(mi.Ray3f(o.T, d.T)).t)
-    truth, normal = first_hits(thing, o, d)
+    length = norm(np.float64(d), axis=1)
+    distance, _, normal, *_ = nearest([thing], o, d / length[:, None])  # in float64
+    truth = distance / length
     scale = np.maximum(abs(o).max(axis=1), abs(o + truth[:, None] * d).max(axis=1))
     errors = {}
     for name, t in ((OURS, ours), (THEIRS, theirs), (FIRST, first)):
@@ -262,7 +253,7 @@ def axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curv
     """
     rng = np.random.default_rng(7)
     radius = min(1 / slender, 1.0)
-    tip = np.float32(min(slender, 1.0) / 2 * unit(np.subtract(*ends(1.0)))).astype(np.float64)
+    tip = np.float32(min(slender, 1.0) / 2 * unit(np.array(TIP))).astype(np.float64)
     base = -tip
     along = unit(tip)
     height = 2 * float(norm(tip))

@@ -1,0 +1,373 @@
+"""Tables of stiff and extreme cases: the reflectance, light paths, scenes that are scaled or moved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.linalg import norm
+
+from mrt_mitsuba.plugins import fresnel, microfacet
+from mrt_mitsuba.rendering.api import render
+from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.scene.report import report_scene
+from mrt_mitsuba.validation.bsdf_probe import pairs_about
+from mrt_mitsuba.validation.laws.bsdf import check_bsdf
+from mrt_mitsuba.validation.oracles import exact
+from mrt_mitsuba.validation.oracles.reference import reference_render, unit
+from mrt_mitsuba.validation.study import Values
+
+
+@dataclass(frozen=True)
+class Case:
+    """A measured figure, with the reason for its limit or for having no limit."""
+
+    name: str
+    what: str  #: is measured
+    why: str  #: it is held to its limit, or cannot hold
+    measured: float = math.nan
+    limit: float | None = None  #: None where nothing can be promised
+    at_most: bool = True  #: else: at least
+
+
+# ----------------------------------------------- Reflectance -----------------------------------------------
+
+REFLECTANCE = (
+    "Relative errors at the same float32 numbers against 50 digits. Directions are what their components "
+    "say, and the half vector is their sum; the gradient's error is relative to the sum of the sizes of its "
+    "terms, since their sum passes through zero."
+)
+# Of tan²θh / alpha², minus the logarithm of exp(-…): the lobe is at 1e-7 of its peak, and at 1e-20
+IN_BOUND, STEEPEST = -np.log([1e-7, 1e-20])
+IORS = np.array([1.5, 1.33, 3, 1 + 1e-7, 1 - 1e-7, 0.5, 1e-3, 1e6], np.float32)
+# The first limit holds where D is at least 1e-7 of its peak, for alpha 1e-4 … 1: 80 roundings, for the
+# argument of exp is up to 16 there, and its error is multiplied by as much. The second holds on the whole
+# grid, where the argument of exp goes to 46: 46 times the 4 roundings of tan²/alpha², and those of the other
+# factors. G and F hold no exp: 16 and 32 roundings, three times what was measured
+WITH_EXP = 5e-6, 2e-5
+LIMITS = {"G": (1e-6, 1.2e-6)}
+# D; G; the value, which is the BSDF times cos θo; the density of visible normals; the derivative of the value
+# with respect to alpha; and the sum of the sizes of the terms of that derivative
+TRUTH = ("D", "G", "BSDF cos", "pdf", "gradient", "slope")
+EXTREME = (0.0, 1e-8, 1e-3, 1.0, 100.0, -0.4)  # roughnesses
+
+Arrays = dict[str, np.ndarray]
+
+
+def reflectance(quick: bool) -> Iterator[Case]:
+    """Yield errors of D, G, the whole, its density and its gradient, of F, and whether all is finite."""
+    lobes = lobes_with_truth(2_000 if quick else 8_000)
+    usual = (abs(np.log10(lobes["alpha"]) + 2) < 2) & (lobes["steepness"] <= IN_BOUND)
+    for name, error in errors(lobes).items():
+        limits = LIMITS.get(name, WITH_EXP)
+        where = "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
+        yield Case(f"{name}, p99.9", where, "a few roundings", np.quantile(error[usual], 0.999), limits[0])
+        where = "alpha 1e-8 … 100, D ≥ 1e-20 of its peak"
+        yield Case(f"{name}, largest", where, "roundings, which exp enlarges", error.max(), limits[1])
+    count = 60 if quick else 600
+    cosines = np.float32(10 ** np.random.default_rng(4).uniform(-7, 0, count * len(IORS)))
+    worst = fresnel_error(cosines, np.repeat(IORS, count))
+    yield Case("F, largest", "cosines 1e-7 … 1, IOR 1e-3 … 1e6", "a few roundings", worst, 2e-6)
+    # where total reflection begins, F ends in a square root: errors are those of g = 0
+    iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
+    critical = np.float32(np.sqrt((1 - np.float64(iors)) * (1 + np.float64(iors))))
+    cosines = (critical.view(np.int32) + np.tile(np.arange(-40, 41, dtype=np.int32), 4)).view(np.float32)
+    what = "the 40 float32 cosines on either side of it, IOR 0.5 … 0.9999"
+    why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
+    yield Case("F at the critical angle", what, why, fresnel_error(cosines, iors), 16 * 2.0**-12)
+    what = "laws of finite values that fail, indices 1 + 1e-7 … 1e6"
+    for alpha in EXTREME:
+        bsdfs = [
+            {"type": "mrt_bsdf", "fresnel": "dielectric", "alpha": alpha, "int_ior": float(n)}
+            for n in IORS[3::4]
+        ]
+        failed = sum(len(check_bsdf(bsdf, quick=True, only=["finite"]).failed) for bsdf in bsdfs)
+        yield Case(f"finite, alpha {alpha:g}", what, "no value is NaN, infinite or negative", failed, 0)
+
+
+def fresnel_error(cosines: np.ndarray, iors: np.ndarray) -> float:
+    """Return the largest relative error of the dielectric term."""
+    truth = [float(exact.fresnel_dielectric(c, 1, n)) for c, n in zip(cosines, iors, strict=True)]
+    found = np.array(fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors)), np.float64)
+    return float(abs(found / truth - 1).max())
+
+
+def errors(lobes: Arrays) -> Arrays:
+    """Return the relative errors [N] of the plugin and its functions, by quantity."""
+    alpha = mi.Float(lobes["alpha"])
+    wi = mi.Vector3f(lobes["wi"].T)
+    wo = mi.Vector3f(lobes["wo"].T)
+    dr.enable_grad(alpha)
+    bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "dielectric", "diffuse_reflectance": 0.0})
+    parameters = mi.traverse(bsdf)
+    parameters["alpha"] = alpha
+    parameters["int_ior"] = mi.Float(lobes["ior"])
+    parameters.update()
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = wi
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(mi.TransportMode.Radiance, 0xFFFFFFFF, 1), si, wo)
+    d = microfacet.beckmann_d(microfacet.tan2_theta(wi + wo), alpha)
+    g = microfacet.smith_g1(wi, alpha) * microfacet.smith_g1(wo, alpha)
+    dr.forward(alpha)
+    slope = np.array(dr.grad(value[0]), float)
+    terms = {"D": d, "G": g, "BSDF cos": value[0], "pdf": pdf}
+    of = {name: abs(np.array(dr.detach(x), float) / lobes[name] - 1) for name, x in terms.items()}
+    of["gradient in alpha"] = abs(slope - lobes["gradient"]) / lobes["slope"]
+    return {name: np.where(np.isnan(error), np.inf, error) for name, error in of.items()}
+
+
+@cache
+def lobes_with_truth(count: int) -> Arrays:
+    """Return ``count`` pairs of directions, or a third more, above the surface, evenly on logarithmic scales.
+
+    By name, for N pairs: the directions ``wi`` and ``wo`` [N, 3], ``alpha``, ``ior``, the ``steepness``
+    tan²θh / alpha², and the exact values of ``TRUTH`` [N].
+    """
+    # a third of them points down
+    rng = np.random.default_rng(2)
+    drawn = 2 * count
+    alpha = np.float32(10 ** rng.uniform(-8, 2, drawn))
+    cosine = 10 ** rng.uniform(-7, 0, drawn)
+    slope = alpha * np.sqrt(STEEPEST * rng.random(drawn) ** 2)
+    wi, wo = pairs_about(cosine, slope, rng)
+    x, y, z = (np.float64(wi) + wo).T  # along the half vector
+    steepness = (x**2 + y**2) / (z * alpha) ** 2
+    keep = (wo[:, 2] > 5e-8) & (steepness < STEEPEST)
+    pairs = {"wi": wi, "wo": wo, "alpha": alpha, "ior": rng.choice(IORS, drawn)}
+    pairs = {name: values[keep] for name, values in pairs.items()}
+    truth = np.array([_exact(*pair) for pair in zip(*pairs.values(), strict=True)])
+    return pairs | {"steepness": steepness[keep]} | dict(zip(TRUTH, truth.T, strict=True))
+
+
+def _exact(wi: Sequence[float], wo: Sequence[float], alpha: float, ior: float) -> list[float]:
+    """Return the values of ``TRUTH`` for a pair of directions."""
+    a = exact.number(alpha)
+    step = a * exact.mpf("1e-20")
+    lobe = exact.lobe(wi, wo, a)
+    # Components are not rounded again: the cosine between the directions is that of them made one unit long
+    sides = zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)
+    half = exact.mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2
+    value = lobe.value * exact.fresnel_dielectric(half, 1, ior)
+    density = lobe.d / (4 * exact.visible_cos(wi, a))
+    # of the logarithms of D, 2 (tan²/alpha² - 1) / alpha, and of both G₁
+    slopes = [(exact.smith_g1(v, a + step) / exact.smith_g1(v, a) - 1) / step for v in (wi, wo)]
+    terms = [2 * lobe.tan2 / a**3, -2 / a, *slopes]
+    values = (lobe.d, lobe.g, value, density, value * sum(terms), value * sum(map(abs, terms)))
+    return [float(x) for x in values]
+
+
+# ---------------------------------------------- Light paths ----------------------------------------------
+
+PATHS = "Differences to the float64 tracer, relative to the value plus a thousandth, of 95 % of the pixels."
+WIDTH = 64
+HEIGHT = 48
+
+# Differences count relative to the value plus a thousandth, and the worst of 95 % of the pixels is held to a
+# bound: the others may show outlines and the edges of shadows
+SMALL = 1e-3
+SHARE = 0.95
+# For plain cases: some float32 roundings, three times what was measured
+PLAIN = 3e-6
+
+GREY = Material(1.3, 0.1, (0.5, 0.5, 0.5), (0.3, 0.2, 0.1))
+MIRROR = Material(1.5, 0.3, (0.95, 0.9, 0.85), (0.2, 0.2, 0.2))
+CAMERA = Camera((0.2, 0.5, 3.0), (0.0, 0.5, 0.0), hfov=20)  # the ball fills the picture
+LIGHTS = (Light((2, 3, 4), (1.0, 0.9, 0.8)), Light((-3, 2, 2), (0.4, 0.5, 0.6)))
+FLOOR = Plane((0, 1, 0), 0.0, GREY)
+BALL = Sphere((0, 0.5, 0), 0.5, GREY)
+BASE = Scene(CAMERA, (0.2, 0.3, 0.4), LIGHTS, (BALL,), (FLOOR,))
+# Onto the ball's highlight under a light behind the camera, five thousandths of the ball across
+CLOSE = Camera(CAMERA.position, (0.033259, 0.5, 0.498893), hfov=0.1)
+
+
+def _ball(**changes: Any) -> Scene:
+    return replace(BASE, spheres=(replace(BALL, material=replace(GREY, **changes)),))
+
+
+def _shiny(**changes: Any) -> Scene:
+    """A material without a diffuse part, which would hide the lobe."""
+    return replace(_ball(diffuse=(0, 0, 0), specular=(1, 1, 1), **changes), sky=(0, 0, 0))
+
+
+def _highlight(alpha: float) -> Scene:
+    behind = Light((0.4, 0.5, 6.0), (1e-4, 1e-4, 1e-4))  # dim: the highlight is bright
+    return replace(_shiny(alpha=alpha), camera=CLOSE, lights=(behind,))
+
+
+def _flat(alpha: float) -> Scene:
+    return replace(_shiny(alpha=alpha), lights=(Light((2, 3, 4), (1e6,) * 3),))
+
+
+def _lit(position: tuple[float, float, float], color: float = 1.0) -> Scene:
+    return replace(BASE, lights=(Light(position, (color,) * 3),))
+
+
+def _hall(specular: float, light: float = 1.0, ior: float = 1.5) -> Scene:
+    """Two mirrors that face each other, with a ball and the camera between them."""
+    material = replace(MIRROR, ior=ior, specular=(specular, 0.95 * specular, 0.9 * specular))
+    walls = (Plane((0, 0, 1), 2.0, material), Plane((0, 0, -1), 2.0, material), Plane((0, 1, 0), 1.0, GREY))
+    ball = Sphere((0.3, -0.2, -0.5), 0.4, GREY)
+    lamp = Light((0.5, 1.5, 0.3), (light,) * 3)
+    return Scene(Camera((0.0, 0.1, 1.0), (0.05, 0.0, -2.0)), (0.2, 0.3, 0.4), (lamp,), (ball,), walls)
+
+
+FULL: Values = {"fresnel": "unity"}
+OPEN = {"clamp": False}
+
+
+@dataclass(frozen=True)
+class Path:
+    """A scene that is hard on a path tracer, and one, or settings, that must not pass for it."""
+
+    name: str
+    what: str
+    scene: Scene
+    fault: Scene | Values
+    limit: float = PLAIN
+    settings: Values = field(default_factory=dict)  #: of both tracers
+    exact: Scene | None = None  #: the scene whose exact picture it is, if not this one
+
+    @property
+    def chosen(self) -> Values:
+        """The settings of both tracers, with what they are by default."""
+        return {"fresnel": "dielectric", "clamp": True, **self.settings}
+
+    def truth(self, scene: Scene, **settings: Any) -> np.ndarray:
+        """The picture [H, W, 3] of a scene by the float64 tracer, with other settings than its own."""
+        return reference_render(scene, width=WIDTH, height=HEIGHT, **self.chosen | settings).image
+
+    def rendered(self) -> np.ndarray:
+        """Our picture [H, W, 3]."""
+        nodes = self.scene.to_dict(width=WIDTH, height=HEIGHT, fresnel=self.chosen["fresnel"])
+        clamp = self.chosen["clamp"]
+        nodes["integrator"] = {"type": "mrt_whitted", "clamp": clamp, "min_contribution": 0.0}
+        return render(nodes, aa=1, lattice="report").image
+
+
+def mirrors() -> Iterator[Path]:
+    """Yield paths between mirrors that face each other."""
+    hall = _hall(0.95)
+    yield Path("facing mirrors", "Ks 0.95, ten bounces", hall, _hall(0.9499), 2e-5, FULL)
+    yield Path("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), {"max_depth": 9}, 2e-5, FULL)
+    costly = _hall(0.95, ior=0.57)
+    yield Path(
+        "bounce budget", "index 0.57: a bounce costs five of ten", costly, {"max_depth": 11}, 2e-5, FULL
+    )
+
+
+def lights() -> Iterator[Path]:
+    """Yield lights that are bright, or in odd places."""
+    bright = _lit((2, 3, 4), 1e4)
+    yield Path("clamp on", "a light of 1e4", bright, OPEN)
+    yield Path("clamp off", "a light of 1e4", bright, _lit((2, 3, 4), 10001), PLAIN, OPEN)
+    yield Path("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), _lit((0, 0.8, 0.6)))
+    yield Path("light on the ball", "its top", _lit((0, 1, 0)), _lit((0, 1.01, 0)), 5e-6)
+    yield Path("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), _lit((4.001e5, 6e5, 7e5)))
+    around = replace(BASE, spheres=(Sphere((0, 0, 0), 9.0, GREY),))
+    what = "camera and lights in it: its back is black"
+    yield Path("inside a ball", what, around, replace(BASE, spheres=()))
+
+
+def materials() -> Iterator[Path]:
+    """Yield materials that are black, bright, smooth, rough or of odd indices."""
+    black = _ball(specular=(0,) * 3, diffuse=(0,) * 3)
+    yield Path("black", "Kd = Ks = 0", black, _ball(specular=(1e-3,) * 3), 3e-7)
+    least = _highlight(1e-8)
+    yield Path("roughness 0", "acts as 1e-8", _highlight(0.0), _highlight(1e-3), 1e-9, {}, least)
+    near = "its highlight from near by"
+    yield Path("roughness 1e-3", near, _highlight(1e-3), _highlight(1.001e-3), 3e-4, OPEN)
+    yield Path("roughness 100", "a lobe of 1e-5", _flat(100.0), _flat(99.0), PLAIN, OPEN)
+    yield Path("negative roughness", "alpha -0.4", _shiny(alpha=-0.4), _shiny(alpha=0.4), 5e-6, OPEN)
+    yield Path("index just above 1", "1 + 1e-7", _shiny(ior=1.0000001), _shiny(ior=1.005), 3e-7)
+    yield Path("index 1e6", "a metal", _shiny(ior=1e6), _shiny(ior=1e4), 1e-5)
+
+
+def light_paths(quick: bool) -> Iterator[Case]:
+    """Yield every path, held to the float64 tracer, and its fault, which must exceed twice its limit."""
+    for path in (*mirrors(), *lights(), *materials()):
+        truth = path.truth(path.exact or path.scene)
+        if isinstance(path.fault, Scene):
+            wrong = path.truth(path.fault)
+        else:
+            wrong = path.truth(path.scene, **path.fault)
+        yield Case(path.name, path.what, "roundings", difference(path.rendered(), truth), path.limit)
+        what = "a scene or setting almost the same"
+        seen = difference(wrong, truth)
+        yield Case(f"{path.name}, its fault", what, "must be seen", seen, 2 * path.limit, False)
+
+
+def difference(image: np.ndarray, truth: np.ndarray) -> float:
+    """The largest difference in a channel that 95 % of the pixels stay below; inf for bad values."""
+    if not (np.isfinite(image) & (image >= 0)).all():
+        return np.inf
+    return float(np.quantile((abs(image - truth) / (truth + SMALL)).max(axis=-1), SHARE))
+
+
+# ---------------------------------------- Scenes scaled and moved ----------------------------------------
+
+# A pixel is another one if a channel differs by more than two steps of an 8-bit picture. After scaling by
+# powers of ten, so many may be: those whose centre ray passes an outline or the edge of a shadow within the
+# roundings of the scaled numbers, seen directly or through ten mirrors. After moving by n scene sizes, they
+# move by n roundings, enlarged by every curved mirror
+VISIBLE = 2 / 255
+SHARE_SCALED = 0.001
+SHARE_MOVED = 1e-4
+
+
+def placements(quick: bool) -> Iterator[Case]:
+    """Yield the share of pixels that change where the report's scenes are scaled, and moved."""
+    # Scene 2 shows the horizon, which a far plane can cut off
+    for number in (0, 2) if quick else range(5):
+        yield from scaled_and_moved(replace(report_scene(number), focal_distance=None), f"scene {number}")
+
+
+def scaled_and_moved(scene: Scene, name: str) -> Iterator[Case]:
+    """Yield the share of pixels that change where a scene is scaled, and moved by multiples of its size."""
+
+    def picture(scene: Scene) -> np.ndarray:
+        return render(scene, width=120, height=90, aa=1, aamode="none").image  # [H, W, 3]
+
+    base = picture(scene)
+
+    def changed(factor: float, sizes: float) -> float:
+        off = abs(picture(placed(scene, factor, sizes)) - base).max(axis=-1)
+        return float(np.mean(~(off <= VISIBLE)))  # NaN is off
+
+    what = "share of pixels off by more than 2/255"
+    for factor in (1e-6, 1e-3, 1e3, 1e6):
+        yield Case(f"{name} times {factor:g}", what, "the same picture", changed(factor, 0), SHARE_SCALED)
+    for sizes in (1.0, 10.0, 100.0, 1e3, 1e4):
+        step = sizes * 2**-23
+        why = f"coordinates have steps of {step:.0e} scene sizes there: normals and outlines move"
+        # Very far away, float32 has no digits left for the scene
+        most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
+        yield Case(f"{name} moved by {sizes:g} sizes", what, why, changed(1, sizes), most)
+
+
+def placed(scene: Scene, factor: float, sizes: float) -> Scene:
+    """The scene with all lengths multiplied, or shifted by a multiple of its size, along no axis.
+
+    Its size: the distance from the camera to what it looks at.
+    """
+    camera = scene.camera
+    size = norm(np.subtract(camera.position, camera.target))
+    way = np.array([0.48, -0.6, 0.64]) * sizes * size
+
+    def by(p: Sequence[float]) -> tuple[float, float, float]:
+        x, y, z = (np.array(p) * factor + way).tolist()
+        return (x, y, z)
+
+    planes = [(p, float(p.distance * factor - unit(np.array(p.normal)) @ way)) for p in scene.planes]
+    return replace(
+        scene,
+        camera=replace(camera, position=by(camera.position), target=by(camera.target)),
+        lights=tuple(replace(light, position=by(light.position)) for light in scene.lights),
+        spheres=tuple(replace(s, center=by(s.center), radius=s.radius * factor) for s in scene.spheres),
+        planes=tuple(replace(plane, distance=distance) for plane, distance in planes),
+    )
