@@ -12,25 +12,27 @@ import warnings
 from collections.abc import Sequence
 from importlib import import_module, util
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from mrt_mitsuba import __version__
 from mrt_mitsuba.errors import MrtError
 from mrt_mitsuba.machine import check_start
 from mrt_mitsuba.rendering.progress import TerminalProgress
 
+if TYPE_CHECKING:
+    from mrt_mitsuba.validation.study import Study
+
 # By name: the module, imported when it is run; what --list says of it; seconds of a quick and of a full run
 # on two idle cores, about
 STUDIES = {
-    "laws": ("bsdf_laws", "does the material obey its own laws", 6, 60),
     "roughconductor": ("roughconductor", "is the material the function that Mitsuba's is", 10, 90),
     "stock": ("stock", "are light, gloss and mirrors what Mitsuba computes", 15, 60),
     "scenes": ("scenes", "are the report's scenes right, with a reason for each pixel off", 10, 60),
-    "filters": ("filters", "do detectors chase noise, is the blur like a lens", 9, 120),
     "adaptive": ("adaptive", "what does an error cost next to the best sampler", 90, 1500),
     "honest": ("honest", "is the mean right and the error as stated, calm to wild", 20, 1200),
-    "stability": ("stability", "where must float32 give out, and where does it not", 16, 220),
-    "error-vs-time": ("error_vs_time", "what does each setting buy for its time", 9, 1500),
+    "stability": ("stability", "where must float32 give out, and where does it not", 16, 150),
+    "error-vs-time": ("error_vs_time", "what does each setting buy for its time", 9, 1200),
     "needs": ("needs", "what do scenes not need, and what would it cost", 9, 60),
-    "speed": ("speed", "how fast against Mitsuba's plugins, other ways, smaller tasks", 20, 300),
 }
 EXTRAS = ("matplotlib", "jinja2", "scipy", "mpmath", "flip_evaluator")
 INTERRUPTED = 128 + signal.SIGINT
@@ -50,6 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     add = parser.add_argument
     add("study", nargs="+", choices=[*STUDIES, "all"], metavar="STUDY", help="one or more, or all")
+    add("--version", action="version", version=f"mrt-validate {__version__}")
     add("--list", action="version", version=listing(), help="list the studies and stop")
     add("--quick", action="store_true", help="fewer samples and cases")
     about = "folder of the report, made if need be (default: validation-report)"
@@ -70,43 +73,56 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_studies(names: Sequence[str], out: Path, *, quick: bool) -> bool:
-    """Run studies in the default variant, print their bounds and write the report; return whether all passed.
+    """Run studies in the default variant, print each and write the report; return whether all passed.
 
     What a study raises becomes its failure. Raises ``MrtError``.
     """
     if missing := " ".join(name.replace("_", "-") for name in EXTRAS if util.find_spec(name) is None):
         raise MrtError(f"{missing} missing: {sys.executable} -m pip install {missing}")
     # Not before: NumPy needs a working folder under some Pythons
-    import drjit as dr
-
-    from mrt_mitsuba import runtime
-    from mrt_mitsuba.validation.study import Study, prepare_folder, save_report, terminal_table
+    from mrt_mitsuba.validation.page import prepare_folder, save_report
+    from mrt_mitsuba.validation.study import Study
 
     prepare_folder(out)
-    seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)
-    print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
-    studies = [Study(name, name, TerminalProgress(unit="step")) for name in names]
-    for study in studies:
-        start = time.perf_counter()
-        try:
-            runtime.use(runtime.default_variant())
-            module = import_module(f"mrt_mitsuba.validation.studies.{STUDIES[study.name][0]}")
-            study.title = module.TITLE
-            print(f"{study.name}: {study.title} ...", file=sys.stderr, flush=True)
-            module.run(study, quick=quick)
-        except Exception:
-            study.failure = traceback.format_exc(limit=-4)
-        study.seconds = time.perf_counter() - start
-        gc.collect()  # scenes that live on, and memory kept for reuse, slow down the next study
-        dr.flush_malloc_cache()
-    print(terminal_table(studies), flush=True)
+    expected = [STUDIES[name][2] if quick else STUDIES[name][3] for name in names]
+    left = sum(expected)
+    print(f"This takes about {_spoken(left)} on two idle cores.", file=sys.stderr)
+    studies = []
+    for name, seconds in zip(names, expected, strict=True):
+        study = Study(name, name, TerminalProgress(unit="step"))
+        run_study(study, STUDIES[name][0], quick=quick)
+        print(study, flush=True)
+        left -= seconds
+        if left:
+            print(f"{name} took {study.seconds:.0f} s; about {_spoken(left)} to go", file=sys.stderr)
+        studies.append(study)
     save_report(out, *studies, quick=quick)
     print(f"\nReport: {out / 'index.html'}")
     return all(study.passed for study in studies)
 
 
+def run_study(study: Study, module_name: str, *, quick: bool) -> None:
+    """Run a study, with its title, failure and seconds."""
+    import drjit as dr
+
+    from mrt_mitsuba import runtime
+
+    start = time.perf_counter()
+    try:
+        runtime.use(runtime.default_variant())
+        module = import_module(f"mrt_mitsuba.validation.studies.{module_name}")
+        study.title = module.TITLE
+        print(f"{study.name}: {study.title} ...", file=sys.stderr, flush=True)
+        module.run(study, quick=quick)
+    except Exception:
+        study.failure = traceback.format_exc(limit=-4)
+    study.seconds = time.perf_counter() - start
+    gc.collect()  # scenes that live on, and memory kept for reuse, slow down the next study
+    dr.flush_malloc_cache()
+
+
 def listing() -> str:
-    """A line on each study, with how long it takes on two idle cores."""
+    """Return a line on each study, with how long it takes on two idle cores."""
     _, _, quick_seconds, full_seconds = zip(*STUDIES.values(), strict=True)
     everything = ("", "all of these", sum(quick_seconds), sum(full_seconds))
     lines = [f"  {'':<15}{'quick':>7}{'full':>8}"]

@@ -11,7 +11,8 @@ from mrt_mitsuba.errors import MrtError, SceneError, UsageError
 from mrt_mitsuba.options import NUMBER, SWITCH
 from mrt_mitsuba.options import check as checked
 from mrt_mitsuba.rendering.progress import TerminalProgress
-from mrt_mitsuba.validation.study import Bound, prepare_folder
+from mrt_mitsuba.validation.page import prepare_folder
+from mrt_mitsuba.validation.study import Bound
 
 AT_LEAST = ("psnr", "p_value")  # the limits of other measures are at most
 KEYS = ("reference", "cases", "shared", "repeats", "errors")  # of a file of cases
@@ -36,7 +37,7 @@ def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: s
         if value is None:
             raise UsageError(f"{name} is not defined for these pictures: {UNDEFINED[name]}")
         bounds.append(Bound(name, value, limit, name not in AT_LEAST))
-        print(bounds[-1])
+        print(bounds[-1].text())
     return int(not all(bound.holds for bound in bounds))
 
 

@@ -29,7 +29,8 @@ from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation import plotting
 from mrt_mitsuba.validation.compare import Array, Difference, compare, read_layer
-from mrt_mitsuba.validation.study import Study, Values, notebook, save_report
+from mrt_mitsuba.validation.page import notebook, save_report
+from mrt_mitsuba.validation.study import Study, Values
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -56,14 +56,20 @@ def error_against_time() -> Answer:
     scenes = (0,) if pages.QUICK else (0, 1, 2, 3, 4, "Cornell box")
     panels: dict[str, work_precision.Findings] = {}
     for scene in scenes:
-        cost = error_vs_time.QUICK if pages.QUICK else error_vs_time.shown(scene)
+        cost = (
+            error_vs_time.QUICK if pages.QUICK else error_vs_time.shown(scene)
+        )
         panels |= error_vs_time.choices(scene, cost)
-    plots = [work_precision.diagram(title, found) for title, found in panels.items()]
+    plots = [
+        work_precision.diagram(title, found)
+        for title, found in panels.items()
+    ]
     rows = error_vs_time.advice(panels)
     decided = sum(row["next best"] is not None for row in rows)
     return answer(
         f"In {decided} of these {len(rows)} comparisons, one way is the "
-        "fastest to the error in the table; in the others, intervals overlap.",
+        "fastest to the error in the table; in the others, no winner can be "
+        "named.",
         plots,
         rows,
     )

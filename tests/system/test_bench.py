@@ -1,4 +1,4 @@
-"""The benchmark: its file, its comparison, and the renders that it measures."""
+"""The benchmark: both sides measure the same cases in turns, by public names."""
 
 from __future__ import annotations
 
@@ -8,91 +8,47 @@ from pathlib import Path
 
 import pytest
 
-from mrt_mitsuba.validation import bench, renders
-from mrt_mitsuba.validation.studies import speed
+from mrt_mitsuba.validation import bench
+from mrt_mitsuba.validation.timing import in_turns, ratio_of, timed_in_turns
 
 
-@pytest.fixture(scope="module")
-def found(tmp_path_factory):
-    """A run of two renders in turns with this same version, and of the scene's pairs."""
-    path = tmp_path_factory.mktemp("bench") / "new" / "bench.json"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(speed, "FULL", speed.Extent(40, 30, 1, (0,), 1, 4))
-        patch.setattr(bench, "cases", lambda given: iter([("small, loaded", {"seconds": 0.5})]))
-        assert bench.main(["--turns", "1", "--out", str(path)]) == 0
-    return path
+@pytest.mark.parametrize("name", ["200 lights", "small, prepared"])
+def test_renders_are_those_of_their_names(name, variant):
+    assert bench.seconds((1, bench.CASES[name][1])) > 0
 
 
-@pytest.mark.slow
-def test_file_has_a_row_for_each_figure(found):
-    run = json.loads(found.read_text())
-    assert {"mitsuba", "llvm", "python", "cores"} <= run["machine"].keys()
-    assert run["options"]["turns"] == 1
-    assert len(run["rows"]) == 2 + 3
-    start, *_ = run["rows"].values()
-    assert start["goal"] == bench.START_GOAL
-    assert start["low"] <= start["ratio"] <= start["high"]
-
-
-@pytest.mark.parametrize("name", ["200 lights", "aamode=noise", "small, with an update"])
-def test_renders_are_those_of_their_names(name, monkeypatch, variant):
-    count, make = renders.CASES[name]
-    monkeypatch.setitem(renders.CASES, name, (1, make))
-    assert renders.seconds(name) > 0
-    assert count >= 1
-
-
-def test_both_sides_take_turns(monkeypatch, tmp_path):
+def test_both_sides_take_turns(tmp_path, capsys, monkeypatch):
     """The other Python measures the same cases."""
-    monkeypatch.setattr(renders, "CASES", {"small": (1, lambda: None)})
-    script = tmp_path / "renders.py"
-    script.write_text("import sys; print('{\"%s\": %s}' % (sys.argv[1], sys.argv[0].count('/')))")
-    monkeypatch.setattr(renders, "__file__", str(script))
-    arguments = ["--small", "--turns", "2", "--before", sys.executable, "--out", str(tmp_path / "b.json")]
-    monkeypatch.setattr(bench, "start", lambda turns: {"seconds": float(turns)})
-    assert bench.main(arguments) == 0
-    rows = json.loads((tmp_path / "b.json").read_text())["rows"]
-    assert rows["small"]["ratio"] == 1
-    assert rows["small"]["other_seconds"] == rows["small"]["seconds"] > 0
+    script = tmp_path / "bench.py"
+    script.write_text('import sys; print(\'{"small, loaded": 2, "%s": 1}\' % sys.argv[-1])')
+    monkeypatch.setattr(bench, "__file__", str(script))
+    out = tmp_path / "new" / "bench.json"
+    assert bench.main(["scene 0", "--turns", "2", "--before", sys.executable, "--out", str(out)]) == 0
+    rows = json.loads(out.read_text())
+    assert rows == {"scene 0": {"seconds": 1, "other seconds": 1, "ratio": 1, "low": 1, "high": 1}}
+    assert "ratio 1" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_comparison_prints_ratios(found, tmp_path, monkeypatch, capsys):
-    before = bench.read(found)
-    twice = [
-        (name, row | {k: 2 * row[k] for k in row if k in ("seconds", "ratio")})
-        for name, row in before.items()
-    ]
-    monkeypatch.setattr(bench, "rows", lambda given: iter([*twice, ("new", {"seconds": 1.0})]))
-    assert bench.main(["--compare", str(found), "--out", str(tmp_path / "b.json")]) == 0
-    *_, columns, start, _, _, _, _, new = capsys.readouterr().out.splitlines()
-    assert columns.endswith("to then")
-    assert start.split()[-2:] == ["1.7", "2"]
-    assert new.endswith(" 1")
-    assert bench.read(tmp_path / "b.json")["small, loaded"] == {"seconds": 1.0, "to then": 2.0}
-
-
-@pytest.mark.parametrize("text", ["{}", "[1]", "no json", '{"rows": 3}'])
-def test_a_file_of_another_kind_is_refused(text, tmp_path, capsys):
-    (tmp_path / "other.json").write_text(text)
+def test_an_unknown_case_is_refused(capsys):
     with pytest.raises(SystemExit):
-        bench.main(["--compare", str(tmp_path / "other.json"), "--out", str(tmp_path / "b.json")])
-    assert "cannot compare" in capsys.readouterr().err
-    assert not (tmp_path / "b.json").exists()
-
-
-def test_a_place_that_cannot_be_written_is_found_before_measuring(tmp_path, capsys):
-    (tmp_path / "file").touch()
-    (tmp_path / "folder.json").mkdir()
-    for out, reason in (("file/b.json", "cannot make the folder"), ("folder.json", "it is a folder")):
-        assert bench.main(["--out", str(tmp_path / out)]) == 1
-        text, errors = capsys.readouterr()
-        assert text == ""
-        assert errors.startswith("make bench: ")
-        assert reason in errors
+        bench.main(["scene 77"])
+    assert "unknown case 'scene 77': choose from scene 0" in capsys.readouterr().err
 
 
 def test_renders_know_public_names_only():
     """So that an earlier version can be measured."""
-    lines = Path(renders.__file__).read_text().splitlines()
-    assert not [line for line in lines if "from mrt_mitsuba" in line or "import mrt_mitsuba." in line]
+    lines = Path(bench.__file__).read_text().splitlines()
+    named = [line for line in lines if "from mrt_mitsuba" in line or "import mrt_mitsuba." in line]
+    assert named == ["    from mrt_mitsuba.validation.timing import in_turns, ratio_of"]  # in the parent
+
+
+def test_runs_are_timed_in_turns():
+    order: list[tuple[str, int]] = []
+    sides = [lambda turn, name=name: order.append((name, turn)) for name in "ab"]
+    (results, seconds), _ = timed_in_turns(sides, 3)
+    assert len(results) == len(seconds) == 3
+    assert "".join(name for name, _ in order) == "ab" + "ab" + "ba" + "ab"
+    assert in_turns([lambda turn: turn, lambda turn: -turn], 3) == [[0, 1, 2], [0, -1, -2]]
+    assert ratio_of([1, 2, 3], [1, 1, 1]) == {
+        "seconds": 2, "other seconds": 1, "ratio": 2, "low": 1.5, "high": 2.5
+    }  # fmt: skip

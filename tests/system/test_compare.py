@@ -49,6 +49,39 @@ def test_measures_are_those_of_a_known_difference():
     assert (same.mae, same.rmse, same.psnr, same.largest, same.flip) == (0, 0, np.inf, 0, 0)
 
 
+def test_flip_chooses_the_exposures_of_the_package():
+    import flip_evaluator
+
+    rng = np.random.default_rng(3)
+    b = np.float32(rng.gamma(0.7, size=(24, 32, 3)))
+    a = np.float32(b * rng.uniform(0.8, 1.2, b.shape))
+    expected = flip_evaluator.evaluate(b, a, "HDR", applyMagma=False, parameters={})[1]
+    assert mrt.compare(a, b).flip == pytest.approx(expected, rel=1e-3)
+    assert mrt.compare(1e-20 * a, 1e-20 * b).flip == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("value", [1e-45, 1e-38, 1e-10, 1.0, 1e30, 3e38])
+def test_flip_is_defined_for_dim_and_bright_pictures(value):
+    """The package's own choice of exposures ends the process."""
+    b = np.full((8, 8, 3), value, np.float32)
+    b[0, 0] = 0
+    assert mrt.compare(b, b).flip == 0
+    for a in (0.99 * b, 0 * b, np.ones_like(b), np.full_like(b, 3e38)):
+        assert 0 <= mrt.compare(a, b).flip <= 1
+    assert mrt.compare(b, 0 * b).flip is None
+
+
+def test_flip_is_not_computed_unless_it_is_asked_for(files, monkeypatch, capsys):
+    """It takes a minute for a megapixel."""
+    monkeypatch.setattr("flip_evaluator.evaluate", lambda *given, **options: 1 / 0)
+    found = mrt.compare(spotted(), GREY)
+    found.save(Path(files["a"]).with_name("difference"))
+    assert main(["diff", files["a"], files["b"], "rmse=0.005"]) == 0
+    assert "flip" not in capsys.readouterr().out
+    with pytest.raises(ZeroDivisionError):
+        main(["diff", files["a"], files["b"], "flip=0.5"])
+
+
 def test_infinite_depths_are_equal_where_both_are():
     depth = np.array([[1.0, np.inf], [2.0, np.inf]], np.float32)
     other = np.array([[1.5, np.inf], [2.0, 3.0]], np.float32)

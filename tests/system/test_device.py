@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from argparse import Namespace
 from pathlib import Path
 
 import mitsuba as mi
@@ -12,7 +11,6 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.validation import bench
 
 SIZE = {"width": 16, "height": 12}
 # Float32 in another order of operations; at edges and in narrow highlights a rounding can turn a pixel
@@ -81,14 +79,3 @@ def test_device_tests_are_selected_where_they_are_asked_for(run_command):
     if "cuda_ad_rgb" not in mi.variants() or runtime.obstacle("cuda_ad_rgb"):
         missing = run_command(*words, MRT_DEVICE="cuda", code=1)
         assert "needs an NVIDIA GPU" in missing.stdout + missing.stderr
-
-
-@pytest.mark.slow
-def test_bench_of_a_device_measures_pairs_in_its_variant(monkeypatch):
-    monkeypatch.setattr(bench, "DEVICE_SIZES", [(80, 60)])
-    rows = bench.rows(Namespace(device="llvm_ad_spectral", turns=1))
-    name, row = next(rows)
-    assert mi.variant() == "llvm_ad_spectral"
-    assert name.endswith("materials, 80x60")
-    assert row["seconds"] > 0
-    assert row["other_seconds"] > 0

@@ -13,6 +13,7 @@ from nodes import rgb, sensor
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
 from mrt_mitsuba.files.images import write_exr
+from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.validation import work_precision
 from mrt_mitsuba.validation.work_precision import Findings, Point
 
@@ -75,18 +76,64 @@ def test_a_timing_takes_fifty_milliseconds(seconds, renders, scene, monkeypatch)
     monkeypatch.setattr(work_precision, "render", render)
     truth = np.ones((*SIZE[::-1], 3))
     found = mrt.error_vs_time(scene, {"path": path(1)}, reference=truth, shared=ONE_RAY, repeats=2)
-    assert calls == [0, 0, *[0] * renders, *[1] * renders]  # a cold and a warm run, then two repeats
+    # a cold and a warm run, then two repeats
+    assert calls == [0, 0, *[0] * renders, *[derived_seed(0, repeat=1)] * renders]
     assert found.points["path"].seconds == pytest.approx(seconds)
 
 
-def test_nothing_is_claimed_below_the_reference(scene):
+def test_a_reference_that_is_too_coarse_is_said_first(scene, tmp_path):
     cases = {f"path {n}": path(n) for n in (4, 256)}
-    found = mrt.error_vs_time(scene, cases, reference=path(16), repeats=2, shared=ONE_RAY)
-    assert found.points["path 4"].rmse > found.points["path 256"].rmse
-    assert not found.points["path 256"].resolved
+    with pytest.warns(
+        mrt.MrtWarning, match=r"too coarse, its own RMSE is .*: nothing .* about path 256; use"
+    ):
+        found = mrt.error_vs_time(scene, cases, reference=path(16), repeats=2, shared=ONE_RAY)
+    assert str(found).startswith("The reference is too coarse")
+    assert "path 256 " in str(found)
+    found.save(tmp_path)
+    page = (tmp_path / "index.html").read_text("utf-8")
+    assert page.index("The reference is too coarse") < page.index("<table")
+    assert "path 256" in page and "not resolved" in page
     assert all(error > 2 * found.reference_error for error in found.errors)
     with pytest.raises(mrt.UsageError, match="take a better reference"):
         mrt.error_vs_time(scene, cases, reference=path(16), repeats=1, errors=[1e-4], shared=ONE_RAY)
+    nothing = replace(found, errors=())
+    assert nothing.verdicts == ["No verdict on time: no case has an error that the reference can resolve."]
+
+
+@pytest.mark.parametrize("errors", [None, [0.004]])
+def test_an_automatic_reference_gets_better_until_it_resolves_all(errors, scene):
+    scene["integrator"] = {"type": "path"}
+    cases = {f"path {n}": path(n) for n in (4, 64)}
+    found = mrt.error_vs_time(scene, cases, repeats=2, shared=ONE_RAY, cold=False, errors=errors)
+    assert found.warning == ""
+    assert all(point.resolved for point in found.points.values())
+    assert found.points["path 64"].bias_interval[0] == 0
+    assert found.reference_error < min(found.errors) / 2
+
+
+def test_an_automatic_reference_of_a_lattice(variant):
+    cases = {f"aa={n}": {"aa": n} for n in (1, 2)}
+    shared = {"width": 32, "height": 24, "aamode": "none", "lattice": "centered"}
+    found = mrt.error_vs_time(0, cases, repeats=1, shared=shared, cold=False)
+    assert list(found.families) == ["aa"]
+    assert all(point.resolved for point in found.points.values())
+
+
+def test_scenes_are_opened_with_all_that_the_caller_said(variant, tmp_path):
+    """The parameters and the focus of an XML file, another sensor, keys of ``mi.traverse``."""
+    mrt.register()
+    nodes = mrt.scene_dict(3, width=32, height=24)
+    (tmp_path / "scene.xml").write_text(XML)
+    for given, options in (
+        (tmp_path / "scene.xml", {"params": {"glow": 3}}),
+        (tmp_path / "scene.xml", {"params": {"glow": 3}, "sensor": 1}),
+        (nodes, {"params": {"material_0.alpha": 0.4}}),
+    ):
+        options = {**options, **ONE_RAY}
+        truth = mrt.render(given, **options)
+        found = mrt.error_vs_time(given, {"a": {}}, reference=truth, repeats=1, shared=options, cold=False)
+        assert not found.failed
+        assert found.points["a"].rmse < 1e-6
 
 
 def test_failed_cases_are_kept_with_the_reason(scene, tmp_path):
@@ -162,6 +209,22 @@ def test_time_to_an_error_is_read_off_the_curve():
     assert np.isnan([*once.time_to(0.1)["a"][1:], once.points["a"].rmse_interval[1]]).all()
 
 
+XML = """<scene version="3.0.0">
+  <default name="glow" value="1"/>
+  <default name="focaldist" value="2"/>
+  <default name="focalrange" value="0.2"/>
+  <integrator type="mrt_whitted"/>
+  <emitter type="mrt_light"><point name="position" x="0" y="3" z="3"/><rgb name="intensity" value="$glow"/></emitter>
+  <shape type="sphere"><bsdf type="mrt_bsdf"/></shape>
+  <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="24"/>
+    <integer name="height" value="18"/></film>
+    <transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+  <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="24"/>
+    <integer name="height" value="18"/></film>
+    <transform name="to_world"><lookat origin="2,3,5" target="0,0,0" up="0,1,0"/></transform></sensor>
+</scene>"""
+
+
 NAMED = "a is the fastest, 1"
 LIKE = "no winner, for the intervals overlap: a, b"
 ONLY = "only a comes so low"
@@ -179,6 +242,10 @@ def test_a_winner_is_named_only_if_intervals_are_apart(times, rmse, errors, verd
     found = found_of(point("a", [1.0, 1.1, 0.9, 1.05]), point("b", times, rmse), errors=errors)
     assert verdict in found.verdicts[0]
     assert verdict in str(found)
+    (row,) = found.advice()  # by the same rule
+    use = {NAMED: "a", ONLY: "a", LIKE: "no winner: a, b"}.get(verdict.removeprefix("RMSE of 0.1: "))
+    assert row["use"] == (use or "nothing comes so low")
+    assert row["next best"] == ("b" if verdict.endswith(NAMED) else None)
 
 
 @pytest.mark.parametrize("count", [3, 5, 10])

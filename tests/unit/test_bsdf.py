@@ -12,10 +12,16 @@ from cases import but_slow
 from numpy.testing import assert_allclose
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation.bsdf_probe import at_angle, evaluate, lobe_pairs, pairs_about, rgb
+from mrt_mitsuba.validation.bsdf_probe import (
+    albedo,
+    at_angle,
+    evaluate,
+    lobe_pairs,
+    pairs_about,
+    rgb,
+)
 from mrt_mitsuba.validation.laws import probe
 from mrt_mitsuba.validation.oracles import exact
-from mrt_mitsuba.validation.studies import bsdf_laws
 from mrt_mitsuba.validation.studies.roughconductor import POINTWISE, compare_pointwise
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -49,11 +55,47 @@ def draw(bsdf: mi.BSDF, wi: np.ndarray, count: int) -> probe.Lanes:
     return probe.Probe(bsdf).sample(probe.Lanes(wi=wi, u=numbers, uv=np.zeros(2)))
 
 
-@pytest.mark.parametrize("name", but_slow(bsdf_laws.MATERIALS, {"narrow", "textured"}))
+COLORS: dict[str, Any] = {"diffuse_reflectance": rgb(KD), "specular_reflectance": rgb((0.5, 0.6, 0.2))}
+EXACT: dict[str, Any] = {"fresnel": "dielectric"}
+CHECKER = {"type": "checkerboard", "color0": 0.1, "color1": 0.6}
+MATERIALS: dict[str, dict[str, Any]] = {
+    "schlick": COLORS,
+    "dielectric, rough, plain sampling": {**COLORS, **EXACT, "alpha": 0.4, "sample_visible": False},
+    "narrow": {**COLORS, **EXACT, "alpha": 0.01},
+    "unity, alpha 1": {"fresnel": "unity", "diffuse_reflectance": 0.0, "alpha": 1.0},
+    "textured": {"alpha": CHECKER, "diffuse_reflectance": CHECKER, "specular_reflectance": 0.3},
+    "negative": {"alpha": -0.3, "specular_reflectance": rgb((0.5, 0.3, 0.2)), "diffuse_reflectance": 0.0},
+    "ggx": {**COLORS, **EXACT, "distribution": "ggx", "alpha": 0.2},
+    "ggx, narrow, plain sampling": {
+        "distribution": "ggx",
+        "alpha": 0.02,
+        "diffuse_reflectance": 0.0,
+        "sample_visible": False,
+    },
+    "with f0": {"f0": rgb((0.9, 0.5, 0.1)), "diffuse_reflectance": 0.0, "alpha": 0.2},
+}
+# The limits of these laws leave room for anybody's BSDF; ours is held to some roundings, eight times what was
+# measured
+OWN = {"gradients": 1e-5, "weights": 2e-6, "variants": 2e-6}
+OWN |= dict.fromkeys(("reciprocity", "eval_pdf", "components", "switch"), 1e-6)
+
+
+@pytest.mark.parametrize("name", but_slow(MATERIALS, {"narrow", "textured"}))
 def test_obeys_the_laws_of_any_bsdf(name):
     """Sampling, weights, energy, reciprocity, gradients and the others."""
-    found = mrt.check_bsdf({"type": "mrt_bsdf", **bsdf_laws.MATERIALS[name]}, quick=True)
+    found = mrt.check_bsdf({"type": "mrt_bsdf", **MATERIALS[name]}, quick=True)
     assert found.passed and not any(law.skipped for law in found.laws.values()), str(found)
+    assert {law: found.laws[law].measured for law in OWN if found.laws[law].measured > OWN[law]} == {}
+
+
+def test_albedos_are_those_that_nori_publishes():
+    """For a BSDF of this family, from a Monte Carlo quadrature with about 1e-3 of noise."""
+    made = bsdf(
+        **EXACT, ext_ior=1.000277, specular_reflectance=0.8, diffuse_reflectance=rgb((0.1, 0.2, 0.15))
+    )
+    luminance = (0.212671, 0.715160, 0.072169)
+    found = [albedo(made, at_angle(angle)) @ luminance for angle in (0, 45, 60, 80, 85)]
+    assert_allclose(found, [0.207067, 0.215733, 0.247884, 0.430936, 0.519016], rtol=3e-3)
 
 
 @in_variants
@@ -95,10 +137,10 @@ def test_samples_fit_density_and_value(distribution, alpha, theta, visible):
     d_cos /= np.pi * alpha**2 * h[2] ** 3
     value, density = made.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(wo))
     scale = np.where(cos_d > 0, 4 * cos_d / d_cos * 3 * (1 - u[0]) ** 2, 0)
-    albedo = np.mean(np.array(value[0], np.float64) * scale)
+    mean_value = np.mean(np.array(value[0], np.float64) * scale)
     probability = np.mean(np.array(density, np.float64) * scale)
     # The grid is 1e-4 off, Mitsuba's drawing of slopes 1e-4; the fit of G₁ for a normaliser was 3e-3 off
-    assert np.mean(np.array(weight[0], np.float64)) == pytest.approx(albedo, rel=4e-4)
+    assert np.mean(np.array(weight[0], np.float64)) == pytest.approx(mean_value, rel=4e-4)
     assert np.mean(np.array(drawn.pdf) > 0) == pytest.approx(probability, rel=4e-4)
 
 

@@ -21,7 +21,8 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.validation.laws.law import Judge, Law, Part, Skip
 from mrt_mitsuba.validation.laws.subject import Given, Subject
-from mrt_mitsuba.validation.study import Study, notebook, save_report
+from mrt_mitsuba.validation.page import notebook, save_report
+from mrt_mitsuba.validation.study import Study
 
 TITLE = "Laws of plugins"
 TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen

@@ -23,7 +23,8 @@ from mrt_mitsuba.validation.laws.examine import Check
 from mrt_mitsuba.validation.laws.probe import not_finite
 from mrt_mitsuba.validation.laws.shape import check_shape
 from mrt_mitsuba.validation.laws.subject import class_name
-from mrt_mitsuba.validation.study import Study, save_report
+from mrt_mitsuba.validation.page import save_report
+from mrt_mitsuba.validation.study import Study
 
 ALIKE = 6  # of one kind of plugin, so many are checked, spread over all
 DEPTH = 12  # bounces that the hunt follows

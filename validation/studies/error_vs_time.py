@@ -15,9 +15,6 @@ from mrt_mitsuba.validation.work_precision import Findings, describe, error_vs_t
 TITLE = "Error against run time"
 
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
-PROMISED = 1 / 16 / 255  # a sixteenth of a step of an 8-bit picture
-CUT_OFFS = (0.0, PROMISED, 1 / 255, 4 / 255, 16 / 255)
-DEPTHS = (1, 2, 3, 5, 10)
 BOX = "Cornell box"
 
 Number = int | str  # of a scene of the report, or ``BOX``
@@ -222,39 +219,6 @@ def sampling(number: int, cost: Cost) -> Trade:
     )
 
 
-def whitted(number: int, cost: Cost) -> Trade:
-    """Compare cut-offs, bounce limits and forms of the Fresnel factor, with the same samples."""
-
-    def integrator(**parameters: Any) -> Values:
-        return {"integrator": {"type": "mrt_whitted", **parameters}}
-
-    cases = {f"min_contribution={255 * c:g}/255": integrator(min_contribution=c) for c in CUT_OFFS}
-    default = list(cases)[1]
-    cases |= {f"max_depth={depth}": integrator(max_depth=depth) for depth in DEPTHS}
-    first = f"max_depth={DEPTHS[0]}"
-    last = f"max_depth={DEPTHS[-1]}"
-
-    def limits(found: Findings) -> list[Limit]:
-        largest = found.points[default].difference.largest
-        gain = rmse(found, last) - rmse(found, first)
-        promise = "as promised; one 16 times too large leaves more"
-        effect = "seen is 6e-4 (scene 9) and above; a limit that has no effect leaves 0"
-        return [
-            ("largest error of the default cut-off", largest, PROMISED, promise),
-            (f"RMSE of {last} - that of {first}", gain, -3e-4, effect),
-        ]
-
-    return Trade(
-        title="cut-off, bounce limit, Fresnel form",
-        truth="no cut-off, max_depth=10, exact Fresnel, the same rays",
-        scene=_scene(number, cost.path_size, fresnel="dielectric"),
-        cases={**cases, "fresnel=schlick": {"scene": _scene(number, cost.path_size)}},
-        reference=integrator(min_contribution=0.0),
-        shared={"aa": 2, "aamode": "none", "lattice": "report"},
-        limits=limits,
-    )
-
-
 def path(number: Number, cost: Cost) -> Trade:
     """Compare Mitsuba's path and direct at rising spp, and mrt_whitted, with a converged path."""
     nodes = _scene(number, cost.path_size)
@@ -288,8 +252,8 @@ def path(number: Number, cost: Cost) -> Trade:
     )
 
 
-TRADES: dict[str, Callable[[Any, Cost], Trade]] = {"sampling": sampling, "whitted": whitted, "path": path}
+TRADES: dict[str, Callable[[Any, Cost], Trade]] = {"sampling": sampling, "path": path}
 ALL = (0, 1, 2, 3, 4, 7, 9)
 # Under path, scenes of broad highlights: elsewhere rare, very bright paths dominate every mean square
 CALM = (0, 7, 9)
-SCENES: dict[str, tuple[Number, ...]] = {"sampling": ALL, "whitted": ALL, "path": (*ALL, BOX)}
+SCENES: dict[str, tuple[Number, ...]] = {"sampling": ALL, "path": (*ALL, BOX)}

@@ -55,6 +55,7 @@ LIMITS = {"G": (1e-6, 1.2e-6)}
 # D; G; the value, which is the BSDF times cos θo; the density of visible normals; the derivative of the value
 # with respect to alpha; and the sum of the sizes of the terms of that derivative
 TRUTH = ("D", "G", "BSDF cos", "pdf", "gradient", "slope")
+BECKMANN = microfacet.Beckmann()
 EXTREME = (0.0, 1e-8, 1e-3, 1.0, 100.0, -0.4)  # roughnesses
 
 Arrays = dict[str, np.ndarray]
@@ -112,8 +113,8 @@ def errors(lobes: Arrays) -> Arrays:
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = wi
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(mi.TransportMode.Radiance, 0xFFFFFFFF, 1), si, wo)
-    d = microfacet.beckmann_d(microfacet.tan2_theta(wi + wo), alpha)
-    g = microfacet.smith_g1(wi, alpha) * microfacet.smith_g1(wo, alpha)
+    d = BECKMANN.d(microfacet.tan2_theta(wi + wo), alpha)
+    g = BECKMANN.g1(wi, alpha) * BECKMANN.g1(wo, alpha)
     dr.forward(alpha)
     slope = np.array(dr.grad(value[0]), float)
     terms = {"D": d, "G": g, "BSDF cos": value[0], "pdf": pdf}
@@ -154,9 +155,9 @@ def _exact(wi: Sequence[float], wo: Sequence[float], alpha: float, ior: float) -
     sides = zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)
     half = exact.mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2
     value = lobe.value * exact.fresnel_dielectric(half, 1, ior)
-    density = lobe.d / (4 * exact.visible_cos(wi, a))
+    density = lobe.d / (4 * exact.Beckmann.visible_cos(wi, a))
     # of the logarithms of D, 2 (tan²/alpha² - 1) / alpha, and of both G₁
-    slopes = [(exact.smith_g1(v, a + step) / exact.smith_g1(v, a) - 1) / step for v in (wi, wo)]
+    slopes = [(exact.Beckmann.g1(v, a + step) / exact.Beckmann.g1(v, a) - 1) / step for v in (wi, wo)]
     terms = [2 * lobe.tan2 / a**3, -2 / a, *slopes]
     values = (lobe.d, lobe.g, value, density, value * sum(terms), value * sum(map(abs, terms)))
     return [float(x) for x in values]
