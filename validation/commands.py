@@ -33,11 +33,11 @@ def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: s
     print(found.text([name for name in MEASURES if not limits or name in CHEAP or name in limits]))
     bounds = []
     for name, limit in wanted.items():
-        value = found.measures()[name]
+        value = found.measures([name])[name]
         if value is None:
             raise UsageError(f"{name} is not defined for these pictures: {UNDEFINED[name]}")
         bounds.append(Bound(name, value, limit, name not in AT_LEAST))
-        print(bounds[-1].text())
+        print(bounds[-1])
     return int(not all(bound.holds for bound in bounds))
 
 

@@ -1,4 +1,4 @@
-"""Parts of the scenes that studies render: cameras, other materials; ten whole scenes; kinds of noise.
+"""Parts of the scenes that studies render: cameras, other materials; nine whole scenes; kinds of noise.
 
 The whole ones use Mitsuba's own lights, lenses, materials, filters and samplers, as users' scenes do.
 """
@@ -161,24 +161,6 @@ def envmap() -> Node:
         floor=_floor(_diffuse(0.6)),
         ball=_ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
     )
-
-
-@scene
-def instances() -> Node:
-    """Nine balls that are one, in three rows."""
-    group = {"type": "ref", "id": "group"}
-    nodes = dict(
-        sensor=sensor([0, 3, 6], [0, 0.5, 0], "box"),
-        group={"type": "shapegroup", "a": _ball([0, 0, 0], 0.4, _diffuse(0.7))},
-        floor=_chessboard(8),
-        sky=_sky((0.3, 0.4, 0.5)),
-        lamp=_lamp([3, 5, 3], 0.7, 20),
-    )
-    for index in range(9):
-        row, column = divmod(index, 3)
-        place = _to().translate([column - 1, 0.4, row - 1])
-        nodes[f"at{index}"] = {"type": "instance", "g": group, "to_world": place}
-    return nodes
 
 
 @scene

@@ -36,9 +36,8 @@ class Bound:
         """Whether the figure is within the limit; NaN never is."""
         return self.measured <= self.limit if self.at_most else self.measured >= self.limit
 
-    def text(self, width: int = 0) -> str:
-        """Return the verdict, the name, padded to a width, and the figures."""
-        return f"{self.verdict:<6} {self.name:<{width}}  {self.measured:.4g} {self.sign} {self.limit:.4g}"
+    def __str__(self) -> str:
+        return f"{self.verdict:<6} {self.name}: {self.measured:.4g} {self.sign} {self.limit:.4g}"
 
     @property
     def sign(self) -> str:
@@ -90,10 +89,8 @@ class Study:
         return {bound.name for bound in self.bounds if not bound.holds}
 
     def __str__(self) -> str:
-        shown = [*self.bounds, *self.goals]
-        width = max((len(bound.name) for bound in shown), default=0)
         lines = [f"{self.name}: {self.title} - {self.verdict.upper()} in {self.seconds:.1f} s"]
-        lines += [f"  {bound.text(width)}" for bound in shown]
+        lines += [f"  {bound}" for bound in (*self.bounds, *self.goals)]
         return "\n".join([*lines, *([f"  FAILED {self.failure.splitlines()[-1]}"] if self.failure else [])])
 
     def at_most(self, name: str, measured: float, limit: float, note: str) -> None:

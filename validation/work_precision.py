@@ -105,7 +105,7 @@ class Point:
     def family(self) -> str:
         """The name without its numbers: cases that differ in these alone are one curve."""
         words = " ".join(re.sub(rf"(?:\b\w+=)?{NUMBER}", " ", self.name).split())
-        return words.strip(" ,") or " ".join(re.sub(NUMBER, " ", self.name).split()) or self.name
+        return words.strip(" ,") or " ".join(re.sub(f"=?{NUMBER}", " ", self.name).split()) or self.name
 
     @property
     def resolved(self) -> bool:

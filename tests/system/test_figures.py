@@ -89,6 +89,7 @@ def test_stated_errors_are_true_in_the_figure():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The reference is too coarse")
 def test_a_study_answers_what_pages_show():
     cost = error_vs_time.Cost(
         size=(24, 18),

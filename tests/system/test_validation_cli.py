@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.study import Study
 
@@ -89,7 +90,7 @@ def test_everything_a_study_finds_is_written(validate, tmp_path, capsys):
     # goals are not reached, and yet the study has passed; one is within the interval
     assert [goal["verdict"] for goal in found["goals"]] == ["slower", "open"]
     shown = capsys.readouterr().out
-    assert "ok     largest error" in shown
+    assert "ok     largest error: 1e-06 <= 1e-05" in shown
     assert "slower ratio of seconds" in shown
     # The page holds all of it and loads nothing; answers come first, tables last, and texts are texts
     links = re.findall(r'(?:src|href)="(.*?)"', page)
@@ -154,15 +155,33 @@ def test_what_is_missing_is_found_before_the_work(monkeypatch, tmp_path, capsys)
     (tmp_path / "file").write_text("")
     (tmp_path / "index.html").mkdir()
     for folder in (tmp_path / "file", tmp_path):
-        assert cli.main(["laws", "--out", str(folder)]) == 1
+        assert cli.main(["needs", "--out", str(folder)]) == 1
         assert str(folder) in (errors := capsys.readouterr().err)
-        assert "laws:" not in errors
+        assert "needs:" not in errors
     monkeypatch.setattr(cli, "EXTRAS", (*cli.EXTRAS, "no_such_library"))
-    assert cli.main(["laws", "--out", str(tmp_path / "report")]) == 1
+    assert cli.main(["needs", "--out", str(tmp_path / "report")]) == 1
     message = capsys.readouterr().err
     assert message.startswith("mrt-validate: no-such-library missing: ")
     assert message.endswith(" -m pip install no-such-library\n")
     assert not (tmp_path / "report").exists()
+
+
+def test_each_result_is_printed_as_its_study_ends(validate, capsys):
+    def later(study: Study, *, quick: bool) -> None:
+        out, errors = capsys.readouterr()
+        assert f"good: {TITLE} - PASSED" in out
+        assert "This takes about 4 s" in errors
+        assert "about 2 s to go" in errors
+        study.at_most("shown", 0, 0, "a reason")
+
+    assert validate(good=good, later=later)[0] == 0
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"mrt-validate {mrt.__version__}\n"
 
 
 def test_interrupt_leaves_the_report_as_it_was(validate, tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -76,9 +76,6 @@ def shown(scene: Number) -> Cost:
     return replace(DOCS, size=(width, width * 3 // 4))
 
 
-Limit = tuple[str, float, float, str]  # a figure's name, its value, the largest one allowed, and the reason
-
-
 @dataclass(frozen=True, kw_only=True)
 class Trade:
     """Settings to compare in a scene."""
@@ -89,7 +86,6 @@ class Trade:
     cases: dict[str, Values]
     reference: Any
     shared: Values = field(default_factory=dict)
-    limits: Callable[[Findings], Sequence[Limit]] | None = None
 
     def measure(self, cost: Cost) -> Findings:
         """Render all cases."""
@@ -112,9 +108,6 @@ def run(study: Study, *, quick: bool) -> None:
         found = trade.measure(cost)
         where = f"{title_of(number).lower()}, {name}"
         describe(study, found, where, f"{title_of(number)}: {trade.title}", trade.truth)
-        if trade.limits and not found.failed:
-            for what, measured, most, why in trade.limits(found):
-                study.at_most(f"{where}: {what}", measured, most, why)
         del trade, found  # what holds them is freed with them
 
 
@@ -148,18 +141,6 @@ def title_of(number: Number) -> str:
     return f"Scene {number}" if isinstance(number, int) else number
 
 
-def rmse(found: Findings, case: str) -> float:
-    """Return the error of a case."""
-    return found.points[case].rmse
-
-
-def judged(found: Findings, case: str) -> Limit:
-    """Return the limit of the reference's error, by the case of least error."""
-    why = "then it changes no error by more than an eighth, and the judge is better than the judged"
-    share = found.reference_error / rmse(found, case)
-    return "error of the reference / least error it judges", share, 0.5, why
-
-
 def _scene(number: Number, size: tuple[int, int], **options: Any) -> Values:
     """A scene of the report, or Mitsuba's Cornell box, as a dict."""
     width, height = size
@@ -189,12 +170,6 @@ def sampling(number: int, cost: Cost) -> Trade:
     def name(lattice: str, mode: str, aa: int) -> str:
         return f"{LATTICES[lattice]}, {MODES[mode]}, aa={aa}"
 
-    least = cost.amounts[0]
-    greatest = cost.amounts[-1]
-    few = name("centered", "none", least)
-    many = name("centered", "none", greatest)
-    edges = name("centered", "sobel", greatest)
-    why = "an edge of the lattice is known to 1 / aa; twice that: samples that do not help leave 1"
     cases = {
         name(lattice, mode, aa): {"aa": aa, "aamode": mode, "lattice": lattice, "focaldist": 0}
         for lattice in LATTICES
@@ -203,11 +178,6 @@ def sampling(number: int, cost: Cost) -> Trade:
         if mode == "none" or (aa > 1 and lattice in cost.lattices)
     }
 
-    def limits(found: Findings) -> list[Limit]:
-        worst = 2 * least / greatest
-        gains = [(f"RMSE of {case} / {few}", rmse(found, case) / rmse(found, few)) for case in (many, edges)]
-        return [*((what, gain, worst, why) for what, gain in gains), judged(found, many)]
-
     truth = {"aamode": "none", "lattice": "centered", "focaldist": 0}
     return Trade(
         title="anti-aliasing mode, aa and lattice",
@@ -215,7 +185,6 @@ def sampling(number: int, cost: Cost) -> Trade:
         scene=_scene(number, cost.size),
         cases=cases | _rounds(cost, focaldist=0),
         reference=[{**truth, "aa": aa} for aa in (cost.most, cost.most * 3 // 4)],
-        limits=limits,
     )
 
 
@@ -233,14 +202,6 @@ def path(number: Number, cost: Cost) -> Trade:
         cases["mrt_whitted"] = {}
         cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
 
-    def limits(found: Findings) -> list[Limit]:
-        few = f"path, {cost.counts[0]} rays"
-        many = f"path, {cost.counts[-1]} rays"
-        gain = (cost.counts[-1] / cost.counts[0]) ** 0.5
-        off = abs(rmse(found, many) / rmse(found, few) * gain - 1)
-        why = "theory: 1 / √spp; seen is 0.02, and a variance wrong by a third leaves 0.15"
-        return [(f"|RMSE of {many} / {few} / theory - 1|", off, 0.15, why), judged(found, many)]
-
     return Trade(
         title="Whitted, direct and path at rising spp",
         truth=f"path with spp={cost.path_spp}",
@@ -248,7 +209,6 @@ def path(number: Number, cost: Cost) -> Trade:
         cases=cases | _rounds(cost, integrator="path"),
         reference={"integrator": "path", "spp": cost.path_spp},
         shared={"aa": 1, "aamode": "none"},
-        limits=limits if calm and cost.counts else None,
     )
 
 

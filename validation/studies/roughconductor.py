@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import html
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from typing import Literal
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.files.images import write_exr
+from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.validation.bsdf_probe import evaluate, lobe_pairs, relative_error
 from mrt_mitsuba.validation.compare import compare, p_values
 from mrt_mitsuba.validation.laws.probe import is_scalar
@@ -36,6 +38,7 @@ NAMES = ("value", "density of visible normals", "density of plain D sampling")
 SAME = "pixels that differ, with the same random numbers"
 RELATIVE = "relRMSE of the pictures"
 P_VALUE = "probability of so much between equal pictures"
+erfc = np.vectorize(math.erfc, otypes=[float])
 LEVEL = 1e-3  # probability with which a test of pictures rejects equal ones
 
 
@@ -121,7 +124,8 @@ class RoughconductorComparison:
     @property
     def equal(self) -> bool:
         """Whether neither single points nor the pictures distinguish them."""
-        return self.errors[P_VALUE] >= LEVEL and all(self.errors[name] <= POINTWISE for name in NAMES)
+        unlikely = self.errors[P_VALUE] < LEVEL  # NaN without SciPy
+        return not unlikely and all(self.errors[name] <= POINTWISE for name in NAMES)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an EXR: ours as R, G, B, and the layers "theirs" and "difference". Raises ``OutputError``."""
@@ -156,7 +160,8 @@ def compare_roughconductor(
     ``size``: width of the pictures in pixels; ``spp``: samples per pixel of each of the ``renders``, whose
     mean and variance are compared; ``pairs``: of directions for the comparison point by point.
 
-    Needs ``pip install 'mrt-mitsuba[validation]'``. Works in a vectorised variant, which becomes current.
+    The probability that the pictures are equal needs SciPy (extra ``validation``), and is NaN without.
+    Works in a vectorised variant, which becomes current.
     Raises ``UsageError`` for a roughness or a distribution that ``roughconductor`` does not take.
     """
     if distribution not in DISTRIBUTIONS:
@@ -169,7 +174,7 @@ def compare_roughconductor(
     ]
 
     def render(index: int, turn: int) -> NDArray[np.float32]:
-        return np.array(mi.render(scenes[index], spp=spp, seed=seed + 1 + index + 2 * turn))
+        return np.array(mi.render(scenes[index], spp=spp, seed=derived_seed(seed, side=index + 1, turn=turn)))
 
     runs = timed_in_turns([partial(render, i) for i in range(2)], renders)
     pictures = np.array([side for side, _ in runs])  # [2, renders, H, W, 3]
@@ -183,7 +188,7 @@ def compare_roughconductor(
     errors = {
         **compare_pointwise(alpha, distribution, count=pairs),
         RELATIVE: compare(first, second).rel_mse ** 0.5,
-        P_VALUE: min(p_values(*pictures).values()),
+        P_VALUE: min(p_values(*pictures).values()) if find_spec("scipy") else math.nan,
         SAME: float(differ.mean()),
     }
     timings = {"ours": seconds, "theirs": other_seconds, "ratio": seconds / other_seconds}

@@ -256,10 +256,6 @@ def mirrors() -> Iterator[Path]:
     hall = _hall(0.95)
     yield Path("facing mirrors", "Ks 0.95, ten bounces", hall, _hall(0.9499), 2e-5, FULL)
     yield Path("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), {"max_depth": 9}, 2e-5, FULL)
-    costly = _hall(0.95, ior=0.57)
-    yield Path(
-        "bounce budget", "index 0.57: a bounce costs five of ten", costly, {"max_depth": 11}, 2e-5, FULL
-    )
 
 
 def lights() -> Iterator[Path]:
@@ -268,11 +264,7 @@ def lights() -> Iterator[Path]:
     yield Path("clamp on", "a light of 1e4", bright, OPEN)
     yield Path("clamp off", "a light of 1e4", bright, _lit((2, 3, 4), 10001), PLAIN, OPEN)
     yield Path("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), _lit((0, 0.8, 0.6)))
-    yield Path("light on the ball", "its top", _lit((0, 1, 0)), _lit((0, 1.01, 0)), 5e-6)
     yield Path("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), _lit((4.001e5, 6e5, 7e5)))
-    around = replace(BASE, spheres=(Sphere((0, 0, 0), 9.0, GREY),))
-    what = "camera and lights in it: its back is black"
-    yield Path("inside a ball", what, around, replace(BASE, spheres=()))
 
 
 def materials() -> Iterator[Path]:
