@@ -39,7 +39,7 @@ TITLE = "Error against time"
 MIN_SECONDS = 0.05  # that one timing takes: a shorter render is repeated, and the mean counts
 RESOLVED = 2.0  # an error is known from this many times the reference's own error on
 ERRORS = 4  # number of errors for which the time is given, unless they are chosen
-MAX_IMPROVEMENTS = 8  # of reference="auto": each doubles its rays
+MAX_DOUBLINGS = 8  # of the rays of reference="auto"
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?%?"
 MIN_RMSE = 1e-15  # a smaller one is 0, which has no logarithm
 LEVEL = 0.95  # of all intervals
@@ -413,16 +413,13 @@ def error_vs_time(
             f"{own_error:.2g}, and only errors above twice that stand out; take a better reference"
         )
     runs, failed = _measure(run, cases, halves[0], repeats, cold, progress or Progress())
-    for step in range(1, MAX_IMPROVEMENTS + 1):
-        points = _points(runs, repeats, halves, own_error)
+    points = _points(runs, repeats, halves, own_error)
+    for step in range(1, MAX_DOUBLINGS + 1 if automatic else 1):
         least = min((p.rmse for p in points.values() if p.rmse), default=math.inf)
-        if not automatic or own_error < min(needed, least / RESOLVED):
+        if own_error < min(needed, least / RESOLVED):
             break
         *halves, own_error = _automatic(run, cases, step)
-    known = [p.rmse for p in points.values() if p.resolved and p.rmse > 1e-9]
-    if errors is None and known:  # rounded up, so that there is a case that comes so low
-        inside = np.geomspace(max(known), min(known), ERRORS + 2)[1:-1]
-        errors = list(dict.fromkeys(float(f"{1.05 * e:.1e}") for e in inside))
+        points = _points(runs, repeats, halves, own_error)
     found = Findings(
         scene=next((result.plan.scene for (result, _), *_ in runs.values()), "scene"),
         points=points,
@@ -430,12 +427,22 @@ def error_vs_time(
         reference=np.mean(halves, axis=0),
         reference_error=own_error,
         repeats=repeats,
-        errors=list(errors or ()),
+        errors=list(_errors(points) if errors is None else errors),
         took=time.perf_counter() - start,
     )
     if found.warning:
         warnings.warn(found.warning, MrtWarning, stacklevel=2)
     return found
+
+
+def _errors(points: Mapping[str, Point]) -> list[float]:
+    """Return errors over the range that was measured, to give the time for."""
+    known = [p.rmse for p in points.values() if p.resolved and p.rmse > 1e-9]
+    if not known:
+        return []
+    inside = np.geomspace(max(known), min(known), ERRORS + 2)[1:-1]
+    # rounded up, so that there is a case that comes so low
+    return list(dict.fromkeys(float(f"{1.05 * e:.1e}") for e in inside))
 
 
 def _runner(scene: Given, shared: Options) -> Run:

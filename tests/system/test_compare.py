@@ -73,13 +73,15 @@ def test_flip_is_defined_for_dim_and_bright_pictures(value):
 
 def test_flip_is_not_computed_unless_it_is_asked_for(files, monkeypatch, capsys):
     """It takes a minute for a megapixel."""
-    monkeypatch.setattr("flip_evaluator.evaluate", lambda *given, **options: 1 / 0)
+    asked = []
+    monkeypatch.setattr("flip_evaluator.evaluate", lambda *given, **options: (asked.append(1), 0.25))
     found = mrt.compare(spotted(), GREY)
     found.save(Path(files["a"]).with_name("difference"))
     assert main(["diff", files["a"], files["b"], "rmse=0.005"]) == 0
     assert "flip" not in capsys.readouterr().out
-    with pytest.raises(ZeroDivisionError):
-        main(["diff", files["a"], files["b"], "flip=0.5"])
+    assert asked == []
+    assert main(["diff", files["a"], files["b"], "flip=0.5"]) == 0
+    assert "ok     flip: 0.25 <= 0.5" in capsys.readouterr().out
 
 
 def test_infinite_depths_are_equal_where_both_are():
