@@ -222,7 +222,7 @@ class Findings:
 
         The ends of the interval are those of a curve that is as low, or as high, as its intervals allow.
         """
-        times = {}
+        times: dict[str, Any] = {}
         for name, points in self.families.items():
             seconds = np.transpose([(p.seconds, *p.seconds_interval) for p in points])  # [3, points]
             errors = np.transpose([(p.rmse, *p.rmse_interval) for p in points])
@@ -458,7 +458,7 @@ def _runner(scene: Given, shared: Options) -> Run:
             key = id(one), repr(params)  # the caller holds the scene
             if key not in loaded:
                 source = open_scene(one, integrator=given.get("integrator"), params=params)
-                focus = {"focaldist": source.focal_distance, "focalrange": source.focal_range}
+                focus: Options = {"focaldist": source.focal_distance, "focalrange": source.focal_range}
                 loaded[key] = source.scene, focus if source.focal_distance is not None else {}
             one, focus = loaded[key]
             given = {**focus, **given}
@@ -557,7 +557,8 @@ def diagram(title: str, found: Findings) -> Figure:
         bars = np.nan_to_num(abs(ends - at[:, :, None])).transpose(1, 2, 0)
         look: Any = {"marker": marker, "color": colors.get(family, plotting.GREY), "elinewidth": 0.8}
         look |= {"linewidth": 1.6, "markersize": 5} if family in colors else {"alpha": 0.7, "markersize": 3}
-        axes.errorbar(*at.T, xerr=bars[0], yerr=bars[1], label=family, **look)
+        x, y = at.T
+        axes.errorbar(x, y, bars[1], bars[0], label=family, **look)
     if found.reference_error:
         label = "within the reference's own error"
         axes.axhspan(bottom / 10, found.reference_error, color="0.9", zorder=0, label=label)

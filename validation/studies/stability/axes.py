@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
@@ -184,7 +184,7 @@ def _hits(
     for: there it sees our mesh.
     """
     o, d = rays
-    things = {f"{type(thing).__name__.lower()}s": (thing,)}
+    things: Any = {f"{type(thing).__name__.lower()}s": (thing,)}
     light = Light((9e6, 9e6, 9e6), (1, 1, 1))
     lit = Scene(Camera((0, 0, 9), (0, 0, 0)), (0, 0, 0), (light,), **things)
     scene = mi.load_dict(lit.to_dict(fresnel="unity"))
