@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mrt_mitsuba.adaptive.metric import METRICS
 from mrt_mitsuba.adaptive.tails import exceedance
 from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
 from mrt_mitsuba.files.images import read_channels, write_exr, write_png
@@ -31,7 +32,7 @@ BLOCKS = 64  # at most, along a side of the picture, whose signs are changed at 
 # changes of the signs, and how many of the largest results tell an exponential law
 FLIPS = 500
 TAIL = 25
-CHEAP = ("mae", "rmse", "rel_mse", "psnr", "largest", "p_value")
+CHEAP = ("mae", "rmse", "rel_mse", "display", "psnr", "largest", "p_value")
 MEASURES = (*CHEAP[:-1], "flip", "p_value")
 # HDR-FLIP exposes from where the brightest value is tone-mapped (ACES) to 0.85 to where the median is
 FLIP_WHITE = 2.11887
@@ -52,6 +53,7 @@ class Difference:
     mae: float  #: mean absolute error
     rmse: float  #: root of the mean squared error
     rel_mse: float  #: mean of (a − b)² / (b² + 0.01)
+    display: float  #: RMSE of sRGB values clipped to [0, 1], as on a screen; a grey level is 1/255
     psnr: float  #: peak signal-to-noise ratio in dB
     largest: float  #: largest absolute error of a channel
     place: tuple[int, int]  #: row and column of the largest error
@@ -152,6 +154,7 @@ def compare(a: Picture, b: Picture, layer: str = "", *, peak: float = 1.0) -> Di
         mae=float(size.mean()),
         rmse=float(square.mean() ** 0.5),
         rel_mse=float(relative.mean()),
+        display=METRICS["display"].rmse(first, second),
         psnr=float(psnr),
         largest=float(size.max()),
         place=divmod(int(size.max(axis=2).argmax()), size.shape[1]),

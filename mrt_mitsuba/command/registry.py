@@ -56,7 +56,7 @@ COMMANDS = {
         function="sweep",
     ),
     "diff": Command(
-        form="A.exr B.exr [layer=NAME] [mae|rmse|rel_mse|psnr|largest|flip|p_value=LIMIT] [out=PATH]",
+        form="A.exr B.exr [layer=NAME] [mae|rmse|rel_mse|display|psnr|largest|flip|p_value=LIMIT] [out=PATH]",
         text="compare two pictures; exit code 1 beyond a limit, 2 if they do not compare",
         module=CHECKS,
         function="diff",

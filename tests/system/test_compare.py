@@ -39,6 +39,9 @@ def test_measures_are_those_of_a_known_difference():
     assert found.rel_mse == pytest.approx(0.01 / n / 0.26, rel=1e-6)
     assert found.psnr == pytest.approx(10 * np.log10(n / 0.01), rel=1e-6)
     assert mrt.compare(spotted(), GREY, peak=2).psnr == pytest.approx(10 * np.log10(4 * n / 0.01), rel=1e-6)
+    srgb = np.diff([1.055 * value ** (1 / 2.4) - 0.055 for value in (0.5, 0.6)])
+    assert found.display == pytest.approx(srgb / n**0.5, rel=1e-6)
+    assert mrt.compare(GREY + 7, GREY + 1).display == 0  # both are white
     assert found.largest == pytest.approx(0.1, rel=1e-6)
     assert found.place == (3, 5)
     assert found.flip > 0
@@ -46,7 +49,7 @@ def test_measures_are_those_of_a_known_difference():
     assert_array_equal(found.difference, spotted() - GREY)
     assert "rmse" in found._repr_html_()
     same = mrt.compare(GREY, GREY)
-    assert (same.mae, same.rmse, same.psnr, same.largest, same.flip) == (0, 0, np.inf, 0, 0)
+    assert (same.mae, same.rmse, same.display, same.psnr, same.largest, same.flip) == (0, 0, 0, np.inf, 0, 0)
 
 
 def test_flip_chooses_the_exposures_of_the_package():
