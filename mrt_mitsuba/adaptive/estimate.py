@@ -164,7 +164,7 @@ class SampleStatistics:
 
     def half_pictures(self, blurred: Blurred | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Colours of the half buffers, [H, W, 3], without the border; 0 where they are invalid."""
-        unknown = self._unknown(0)[..., None]
+        unknown = self.unknown(0)[..., None]
         first, second = (
             np.where(unknown, 0, self.film.picture(half[..., :3])) for half in self.halves.pictures()
         )
@@ -176,7 +176,7 @@ class SampleStatistics:
         They are 0 where the picture is invalid.
         """
         squares = metric.squared_errors(*self.half_pictures(blurred))
-        return np.where(self._unknown(REACH if blurred else 0)[..., None], 0, squares)
+        return np.where(self.unknown(REACH if blurred else 0)[..., None], 0, squares)
 
     def luminance(self) -> float:
         """Mean luminance of the picture in the pilot buffers, which no averaged value decides."""
@@ -197,7 +197,7 @@ class SampleStatistics:
         """True where the filter spreads invalid values to, [H, W]."""
         return dilated(self.invalid, self.film.reach)
 
-    def _unknown(self, reach: int) -> np.ndarray:
+    def unknown(self, reach: int = 0) -> np.ndarray:
         """True within ``reach`` pixels of invalid values of the picture, [H, W], without the border."""
         return dilated(self.without_border(self.invalid_dilated), reach)
 

@@ -13,11 +13,11 @@ import numpy as np
 from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
 from mrt_mitsuba.adaptive.target import AdaptiveIntegrator, Goal, Target
 from mrt_mitsuba.errors import warn
-from mrt_mitsuba.plugins.parameters import ParameterError, integer, number
+from mrt_mitsuba.plugins.parameters import ParameterError, flag, integer, number
 from mrt_mitsuba.plugins.variants import construct_quietly, text_of
 from mrt_mitsuba.rendering.settings import MAX_SPP
 
-PARAMETERS = ("target", "metric", "max_spp", "max_seconds", "spp")
+PARAMETERS = ("target", "metric", "denoise", "max_spp", "max_seconds", "spp")
 MIN_SPP = 8  # rays of a pixel in the first round
 
 
@@ -38,6 +38,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
                      string               with another metric, of 1
     ``metric``       string      linear   "linear", "relative" or "display": RMSE of linear values, relative
                                           to them, or of sRGB values clipped to [0, 1]
+    ``denoise``      boolean     false    mix the picture with its denoised version where that errs less
     ``max_spp``      integer     4096     >= 8, rays of a pixel at most, on average
     ``max_seconds``  float       0        >= 0, time to spend at most; 0 for no limit
     ``spp``          integer     (none)   >= 8, in place of ``target``: a mean of so many rays a pixel
@@ -194,11 +195,12 @@ def _goal(props: mi.Properties) -> Goal:
     metric = props.get("metric", LINEAR.name)
     if metric not in METRICS:
         raise ParameterError(f'mrt_adaptive: "metric" is {metric!r}, but must be one of {", ".join(METRICS)}')
+    denoise = flag(props, "denoise", False)
     seconds = number(props, "max_seconds", 0.0, least=0) or None
     most = integer(props, "max_spp", MAX_SPP, least=MIN_SPP, most=2**24)
     if "spp" in props:
-        return Goal(None, integer(props, "spp", most, least=MIN_SPP, most=65536), seconds, metric)
-    return Goal(_target(props), most, seconds, metric)
+        return Goal(None, integer(props, "spp", most, least=MIN_SPP, most=65536), seconds, metric, denoise)
+    return Goal(_target(props), most, seconds, metric, denoise)
 
 
 def _target(props: mi.Properties) -> Target:

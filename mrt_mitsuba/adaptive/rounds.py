@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.adaptive.allocate import HEAVY_TAIL_SHAPE, Allocator
+from mrt_mitsuba.adaptive.denoise import Denoiser, cautious_error
 from mrt_mitsuba.adaptive.error import ErrorEstimate, Round, RoundPicture
 from mrt_mitsuba.adaptive.estimate import (
     Blurred,
@@ -28,6 +29,7 @@ from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
 from mrt_mitsuba.adaptive.tails import PARETO_K_THRESHOLD
 from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import warn
+from mrt_mitsuba.filters.denoise import Denoised
 from mrt_mitsuba.plugins import plugin
 from mrt_mitsuba.rendering.exposing import Exposer, RayBatch, film_samples
 from mrt_mitsuba.rendering.progress import Advance
@@ -55,6 +57,7 @@ class Finished(NamedTuple):
     rounds: list[Round]
     stats: SampleStatistics
     error: ErrorEstimate
+    denoised: Denoised | None  #: None where it was not asked for, or left out
 
 
 @dataclass(frozen=True)
@@ -126,15 +129,17 @@ def run_rounds(
     goal: Goal,
     blurred: Blurred | None = None,
     on_round: OnRound | None = None,
+    denoiser: Denoiser | None = None,
 ) -> Finished:
     """Trace rounds until a goal is reached.
 
     Warns of a target that is not reached, and of an error that cannot be trusted. ``blurred``: what is done
     to the picture in the end, after which errors are estimated. ``on_round`` is called after each round, and
-    stops by returning False.
+    stops by returning False. With a ``denoiser``, errors are those of the picture that it mixes.
     """
     start = time.perf_counter()
     done = list[Round]()
+    denoised: Denoised | None = None
     spent = 0
     pixels = tracer.film.pixels
     target: float | None = None
@@ -146,23 +151,38 @@ def run_rounds(
         spent += cost
         with stage("rounds", cost, _message(done, target, cost / pixels)) as advance:
             stats = tracer.trace(stats, following.allocation, advance)
-        rmse = math.sqrt(float(stats.squared_errors(stats.metric, blurred).mean(-1).mean()))
-        now = Round(time.perf_counter() - start, spent / pixels, rmse)
-        done.append(now)
         if goal.target and target is None:
             target = goal.target.rmse(stats.metric.reference or stats.luminance())
+        plain = math.sqrt(float(stats.squared_errors(stats.metric, blurred).mean(-1).mean()))
+        denoised = None
+        if denoiser and target and denoiser.pays(spent / pixels, plain, target):
+            denoised = denoiser.mixture(stats, plain)
+        rmse = plain if denoised is None else denoised.rmse
+        now = Round(time.perf_counter() - start, spent / pixels, rmse)
+        done.append(now)
         log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
-        stopped = on_round is not None and on_round(_shown(now, stats, target, blurred)) is False
-        if stopped or target == 0:
+        stopped = on_round is not None and on_round(_shown(now, stats, target, blurred, denoised)) is False
+        if stopped or target == 0 or (denoised and target and cautious_error(denoised) <= target):
             break
-        following = plan_round(tracer.allocator, stats, goal, target, now, following)
+        wanted = target
+        if denoiser and target:
+            wanted = denoiser.plain_target(now.spp, plain, target)
+        now = replace(now, rmse=plain)
+        following = plan_round(tracer.allocator, stats, goal, wanted, now, following)
+    if denoiser and denoised is None and not denoiser.left_out and target != 0:
+        denoised = denoiser.mixture(stats, plain)
+        done[-1] = replace(now, rmse=denoised.rmse, seconds=time.perf_counter() - start)
+    now = done[-1]
     error = replace(estimate_error(stats, blurred), target=target)
+    if denoised is not None:
+        high = denoised.high if error.tail <= PARETO_K_THRESHOLD else math.inf
+        error = replace(error, rmse=denoised.rmse, low=denoised.low, high=high)
     warnings = [stats.invalid_warning(), _tail_warning(error)]
     if not stopped:
         warnings.append(_target_warning(goal, now, target))
     if any(warnings):
         warn("; ".join(filter(None, warnings)))
-    return Finished(done, stats, error)
+    return Finished(done, stats, error, denoised)
 
 
 def plan_round(
@@ -240,13 +260,21 @@ def _min_spp(stats: SampleStatistics, seen: Forecast) -> float:
 
 
 def _shown(
-    now: Round, stats: SampleStatistics, target: float | None, blurred: Blurred | None
+    now: Round,
+    stats: SampleStatistics,
+    target: float | None,
+    blurred: Blurred | None,
+    denoised: Denoised | None,
 ) -> RoundPicture:
     """Return a round with copies of its picture, its error and its rays."""
     image = stats.image()[..., :3]
     if blurred is not None:
         image = blurred(image)
-    error = pixel_error(stats, pixel_variance(stats, blurred), blurred)
+    if denoised is not None:
+        image = denoised.image
+        error = denoised.error
+    else:
+        error = pixel_error(stats, pixel_variance(stats, blurred), blurred)
     with np.errstate(over="ignore"):  # errors beyond float32
         return RoundPicture(
             seconds=now.seconds,

@@ -71,6 +71,7 @@ class Goal:
     max_spp: int  #: rays of a pixel, on average
     max_seconds: float | None = None  #: None: no limit
     metric: str = "linear"  #: of the error, one of ``METRIC_NAMES``
+    denoise: bool = False  #: errors are those of the picture mixed with its denoised version
 
 
 class AdaptiveIntegrator(ABC):  # registered, as Mitsuba's classes take no second base

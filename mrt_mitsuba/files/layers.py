@@ -24,7 +24,7 @@ a derived layer. ``free_with``: the passes that make it in any case. ``counts``:
 counts. ``internal``: it cannot be asked for.
 """
 
-_ROWS = (
+_FIRST_HITS = (
     Layer(
         "depth",
         "Z",
@@ -39,11 +39,17 @@ _ROWS = (
     Layer("uv", "UV", FIRST_HIT, "texture coordinates", lambda r: r.at_hit("Vector2f", r.si.uv)),
     Layer("shape", "I", FIRST_HIT, "shape, from 1; 0 for none", lambda r: r.shape),
     Layer("material", "I", FIRST_HIT, "material, from 1; 0 for none", lambda r: r.material),
+)
+_DERIVED = (
     Layer("edges", "Y", DERIVED, "what the edge detector measured", free_with=("edges",)),
     Layer("samples", "Y", DERIVED, "samples of the pixel", free_with=("edges", "rounds")),
     Layer("error", "Y", DERIVED, "standard error of the pixel", free_with=("rounds",)),
     Layer("variance", "RGB", DERIVED, "variance of the pixel", free_with=("rounds",)),
+    Layer("noisy", "RGB", DERIVED, "picture before denoising"),
+    Layer("denoised", "Y", DERIVED, "weight of the denoised picture"),
     Layer("blur", "Y", DERIVED, "amount of blur in pixels"),
+)
+_AVERAGED = (
     Layer("image", "RGB", AVERAGED, "the picture", lambda r: r.image, internal=True),
     Layer("direct", "RGB", AVERAGED, "light without mirror rays", lambda r: r.rgb(r.trace.direct)),
     Layer(
@@ -58,6 +64,6 @@ _ROWS = (
     Layer("square", "RGB", AVERAGED, "square of the picture", lambda r: r.image * r.image, internal=True),
 )
 
-TABLE = {layer.name: layer for layer in _ROWS}
+TABLE = {layer.name: layer for layer in (*_FIRST_HITS, *_DERIVED, *_AVERAGED)}
 #: The layers that can be asked for, by name
 LAYERS = {name: layer for name, layer in TABLE.items() if not layer.internal}

@@ -130,6 +130,7 @@ def render(
     aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None = None,
     target: Target | float | str | Sequence[float] | None = None,
     metric: Literal["linear", "relative", "display"] | None = None,
+    denoise: bool = False,
     maxspp: int | None = None,
     maxseconds: float | None = None,
     lattice: Lattice | None = None,
@@ -283,7 +284,7 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
         return Result(
             image=layers["image"],
             layers=_channels(layers, plan),
-            plan=plan if error is None else plan.resolved(error.target),
+            plan=plan if error is None else plan.resolved(error.target, picture.left_out),
             timings=timings,
             rays=job.rays,
             kernel_launches=job.launches,

@@ -10,12 +10,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
+import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba import filters
 from mrt_mitsuba.files.layers import TABLE
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
+from mrt_mitsuba.plugins.signals import left_to_other_threads
 from mrt_mitsuba.rendering.exposing import FILM_PREFIX, Exposer, FilmAccumulator, RayBatch, widened
 from mrt_mitsuba.rendering.film import Region
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
@@ -26,6 +28,8 @@ from mrt_mitsuba.rendering.shading import Shader
 
 if TYPE_CHECKING:
     from mrt_mitsuba.adaptive.error import ErrorEstimate, Round
+
+FEATURE_SPP = 16  # of albedo and normals, which a denoiser is given
 
 
 class Passes:
@@ -47,6 +51,7 @@ class Passes:
         self.layers: dict[str, np.ndarray] = {}
         self.error: ErrorEstimate | None = None
         self.rounds: Sequence[Round] = ()
+        self.left_out: tuple[str, str] | None = None  # what the rounds did not need, and why
 
     def run(self) -> None:
         """Run the passes of the plan."""
@@ -138,6 +143,7 @@ class Passes:
 
     def _run_rounds(self, step: Rounds, exposer: Exposer) -> None:
         """Expose pixels until the noise is as low as was asked for."""
+        from mrt_mitsuba.adaptive.denoise import Denoiser
         from mrt_mitsuba.adaptive.estimate import pixel_error, pixel_variance
         from mrt_mitsuba.adaptive.rounds import Tracer, run_rounds
 
@@ -146,7 +152,8 @@ class Passes:
         np.empty(2**25 - 2**16, np.uint8)
         blurred = self._blurred if self._plan.blur else None
         tracer = Tracer(exposer, self._seed)
-        finished = run_rounds(tracer, self._job.stage, step.goal, blurred, self._job.on_round)
+        denoiser = Denoiser(self._features) if step.goal.denoise else None
+        finished = run_rounds(tracer, self._job.stage, step.goal, blurred, self._job.on_round, denoiser)
         self.rounds = finished.rounds
         self.error = finished.error
         stats = finished.stats
@@ -157,6 +164,25 @@ class Passes:
             self._layer("variance")[:] = variance[self._seen]
             self._layer("error")[..., 0] = error[self._seen]
         self._layer("samples")[..., 0] = stats.samples()[self._seen]
+        if denoiser and denoiser.left_out:
+            self.left_out = ("denoising", denoiser.left_out)
+        if step.goal.denoise:
+            denoised = finished.denoised
+            self._layer("noisy")[:] = self._layer("image")
+            if denoised is not None:
+                self._layer("image")[:] = denoised.image[self._seen]
+                self._layer("denoised")[..., 0] = denoised.weight[self._seen]
+                self._layer("error")[..., 0] = denoised.error[self._seen]
+            else:
+                self._layer("denoised")[:] = 0
+
+    def _features(self) -> tuple[np.ndarray, np.ndarray]:
+        """Albedo and shading normals of first hits, averaged over a few rays by the film, [H, W, 3] each."""
+        aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
+        seed = derived_seed(self._plan.seed, features=0)
+        with left_to_other_threads():
+            picture = aov.render(self._shader.scene, self._shader.sensor, seed=seed, spp=FEATURE_SPP)
+        return tuple(np.split(np.array(picture, np.float32)[..., -6:], 2, axis=-1))
 
     def _develop(self, exposer: Exposer, picture: np.ndarray) -> None:
         """Turn what is exposed, [H, W, channels], into layers."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ import mitsuba as mi
 
 from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
 from mrt_mitsuba.adaptive.target import Goal
-from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.errors import UsageError, needs_extra
 from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.plugins.whitted import plan as kernel_plan
@@ -116,12 +117,14 @@ class Rounds(Pass):
         kind = "an error" if metric is LINEAR else f"a {metric.name} error"
         if goal.target is None:
             where = "the variance" if metric is LINEAR else f"the {metric.name} error"
-            return f"adaptive sampling: {goal.max_spp} spp on average, allocated by {where}"
+            denoised = ", denoised" if goal.denoise else ""
+            return f"adaptive sampling: {goal.max_spp} spp on average, allocated by {where}{denoised}"
         error = str(goal.target)
         if goal.target.relative and metric.reference is None:
             error += " of the mean luminance" + ("" if self.rmse is None else f", {self.rmse:.3g}")
         seconds = "" if goal.max_seconds is None else f" or {goal.max_seconds:g} s"
-        return f"adaptive sampling to {kind} of {error}, at most {goal.max_spp} spp{seconds}"
+        denoised = ", denoised where that pays" if goal.denoise else ""
+        return f"adaptive sampling to {kind} of {error}, at most {goal.max_spp} spp{seconds}{denoised}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,10 +184,11 @@ class Plan:
         """The pass that gives the picture depth of field, if any."""
         return next((step for step in self.passes if isinstance(step, Blur)), None)
 
-    def resolved(self, rmse: float | None) -> Plan:
-        """The plan with the RMSE that its target has come to."""
+    def resolved(self, rmse: float | None, left_out: tuple[str, str] | None = None) -> Plan:
+        """The plan with the RMSE that its target has come to, and what the rounds have left out."""
         steps = (replace(step, rmse=rmse) if isinstance(step, Rounds) else step for step in self.passes)
-        return replace(self, passes=tuple(steps))
+        further = () if left_out is None else (left_out,)
+        return replace(self, passes=tuple(steps), left_out=(*self.left_out, *further))
 
     def __str__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]
@@ -284,6 +288,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
     passes = tuple(_passes(traced, choices, shader))
     names = {step.name for step in passes}
     returned = asked | {name for name in possible if names & set(TABLE[name].free_with)}
+    returned |= possible & {"noisy", "denoised"}
     region = Region(*(settings.region or (0, 0, source.width, source.height)))
     reach = edges.REACH * bool(choices.detector) + dof.REACH * bool(choices.focaldist)
     channels = sum(len(TABLE[name].letters) for name in traced | returned)
@@ -332,7 +337,7 @@ def _in_force(choices: _Choices, source: Source, shader: Shader, returned: froze
     if goal and goal.target:
         values |= {"target": goal.target.plain, "maxspp": goal.max_spp}
     if goal:
-        values |= {"maxseconds": goal.max_seconds, "metric": goal.metric}
+        values |= {"maxseconds": goal.max_seconds, "metric": goal.metric, "denoise": goal.denoise}
     return {name: values[name] for name in _NAMED if values[name] is not None}
 
 
@@ -360,6 +365,7 @@ def _check(choices: _Choices, source: Source, shader: Shader) -> None:
     if goal is None:
         only = "{0} is of use only where rays go in rounds: with target or aamode=noise"
         _refuse(settings, ("metric", "maxspp", "maxseconds", "on_round"), (), only)
+        _refuse(settings, ("denoise",), (False,), "{0} needs two half pictures: give target or spp")
     else:
         name = f"target={goal.target}" if goal.target else "aamode=noise"
         both = (
@@ -369,6 +375,11 @@ def _check(choices: _Choices, source: Source, shader: Shader) -> None:
         if settings.error is not None:
             _refuse(settings, ("aamode", "spp"), (NOISE,), both)
         _refuse(settings, ("aa", "lattice", "region"), (FILM,), both)
+        if goal.denoise:
+            if choices.focaldist:
+                raise UsageError("denoise with depth of field as a filter: write focaldist=0")
+            with needs_extra("denoise"):
+                importlib.import_module("pyoidn")
     if shader.whole:
         if goal is not None:
             raise UsageError(
@@ -407,6 +418,8 @@ def _layers(choices: _Choices, shader: Shader) -> tuple[frozenset[str], frozense
     possible = set(known)
     if choices.goal is None:
         possible -= {"error", "variance"}
+    if choices.goal is None or not choices.goal.denoise:
+        possible -= {"noisy", "denoised"}
     if choices.aamode not in DETECTORS:
         possible -= {"edges"}
     if asked == LAYERS.keys():

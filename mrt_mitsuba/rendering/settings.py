@@ -65,6 +65,7 @@ class SharedOptions(TypedDict, total=False):
     aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None
     target: Target | float | str | Sequence[float] | None
     metric: Literal["linear", "relative", "display"] | None
+    denoise: bool
     maxspp: int | None
     maxseconds: float | None
     lattice: Lattice | None
@@ -131,6 +132,9 @@ class RenderSettings:
         choice(*METRIC_NAMES),
         "error of target and aamode=noise: RMSE of linear values, relative to them, or of sRGB in [0, 1]",
         METRIC_NAMES[0],
+    )
+    denoise: bool = option(
+        False, SWITCH, "mix the picture with its denoised version where that errs less; with target or spp"
     )
     maxspp: int | None = option(
         None, integer(MIN_SPP, 2**24), "rays of a pixel at most, with a target, on average", str(MAX_SPP)
@@ -247,18 +251,21 @@ class RenderSettings:
         """
         metric = self.metric or METRIC_NAMES[0]
         if self.error is not None:
-            return Goal(self.error, self.maxspp or MAX_SPP, self.maxseconds, metric)
-        if self.aamode == NOISE:
+            return Goal(self.error, self.maxspp or MAX_SPP, self.maxseconds, metric, self.denoise)
+        if self.aamode == NOISE or (self.denoise and self.spp is not None and self.aamode is None):
             mean = self.spp or 1
             if mean < MIN_SPP:
                 raise UsageError(
                     f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
                 )
-            return Goal(None, min(mean, self.maxspp or mean), self.maxseconds, metric)
+            return Goal(None, min(mean, self.maxspp or mean), self.maxseconds, metric, self.denoise)
         if stated is None or self.aamode is not None or self.spp is not None:
             return None
         seconds = stated.max_seconds if self.maxseconds is None else self.maxseconds
-        return Goal(stated.target, self.maxspp or stated.max_spp, seconds, self.metric or stated.metric)
+        denoise = self.denoise or stated.denoise
+        return Goal(
+            stated.target, self.maxspp or stated.max_spp, seconds, self.metric or stated.metric, denoise
+        )
 
     def model(self) -> dict[str, Any]:
         """The options given about a model and its view, as ``obj.obj_scene`` takes them.

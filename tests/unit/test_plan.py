@@ -111,6 +111,7 @@ VALUES = {
     "aamode": "none",
     "target": 0.5,
     "metric": "display",
+    "denoise": True,
     "maxspp": 64,
     "maxseconds": 60,
     "lattice": "centered",
@@ -140,6 +141,7 @@ IN_FRONT = scene(ball={**BALL, "center": [0, 0, 4]})
 # What an option needs to make a difference; the others make one in scene 3
 NEEDED = {
     "metric": TARGET,
+    "denoise": TARGET,
     "maxspp": TARGET,
     "maxseconds": TARGET,
     "motionsamples": MOTION,

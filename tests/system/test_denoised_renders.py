@@ -1,0 +1,89 @@
+"""``denoise=True``: what it saves, what it leaves out, what it refuses."""
+
+from __future__ import annotations
+
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cases import Cases
+from numpy.testing import assert_allclose, assert_array_equal
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.adaptive.metric import METRICS
+from mrt_mitsuba.validation.scenery import load_kind
+
+SIZE = 96
+
+
+@pytest.fixture(scope="module")
+def calm() -> mi.Scene:
+    mrt.register()
+    return load_kind("calm", SIZE)
+
+
+def test_the_noisy_mean_is_that_without_denoising(calm):
+    plain = mrt.render(calm, aamode="noise", spp=64)
+    found = mrt.render(calm, denoise=True, spp=64)
+    noisy = np.stack([found.layers[f"noisy.{letter}"] for letter in "RGB"], -1)
+    assert_array_equal(noisy, plain.image)
+    weight = found.layers["denoised.Y"]
+    assert weight.min() >= 0 and weight.max() <= 1
+    assert_array_equal(found.image[weight == 0], noisy[weight == 0])
+    assert found.error.rmse < 0.9 * plain.error.rmse
+    assert "denoised" in str(found.plan)
+    assert_array_equal(mrt.render(calm, denoise=True, spp=64).image, found.image)
+
+
+@pytest.mark.parametrize(("metric", "target"), [("linear", 0.0025), ("relative", 0.008), ("display", 0.0025)])
+def test_a_target_takes_fewer_rays(calm, metric, target):
+    """Four tenths and more; and the true error is in the stated interval of 95 %."""
+    truth = np.mean([np.array(mi.render(calm, spp=1024, seed=k)) for k in range(4)], 0)
+    options = {"target": target, "metric": metric}
+    plain = mrt.render(calm, **options)
+    found = mrt.render(calm, denoise=True, **options)
+    assert found.rounds[-1].spp < 0.6 * plain.rounds[-1].spp
+    assert found.error.metric == metric
+    assert found.error.rmse <= found.error.target
+    assert found.error.low <= METRICS[metric].rmse(found.image, truth) <= found.error.high
+    assert found.options["denoise"] is True
+    assert found.rounds[-1].rmse == found.error.rmse
+
+
+def test_what_does_not_pay_is_left_out():
+    """Of a chessboard far finer than pixels, a denoiser knows nothing that rays do not say sooner."""
+    scene = load_kind("texture", SIZE)
+    found = mrt.render(scene, target=0.004, denoise=True)
+    plain = mrt.render(scene, target=0.004)
+    assert "without denoising:" in str(found.plan)
+    assert found.layers["denoised.Y"].max() == 0
+    assert found.error.rmse <= found.error.target
+    assert found.rounds[-1].spp < 1.2 * plain.rounds[-1].spp
+
+
+def test_mrt_adaptive_denoises(calm):
+    nested = {"type": "mrt_adaptive", "spp": 64, "denoise": True, "nested": {"type": "path", "max_depth": 5}}
+    shown = np.array(mi.render(calm, integrator=mi.load_dict(nested)))
+    assert_allclose(shown[..., :3], mrt.render(calm, denoise=True, spp=64).image, atol=1e-6)
+
+
+refused = Cases()
+refused(dict(denoise=True), "denoise needs two half pictures: give target or spp")
+refused(
+    dict(denoise=True, spp=64, focaldist=2.0), "denoise with depth of field as a filter: write focaldist=0"
+)
+refused(dict(denoise=True, spp=2), "16 or more")
+refused(dict(denoise="maybe", spp=64), "denoise='maybe'")
+
+
+@pytest.mark.parametrize(("options", "words"), refused)
+def test_refusals(calm, options, words):
+    with pytest.raises(mrt.UsageError, match=words):
+        mrt.render(calm, **options)
+
+
+def test_a_missing_library_is_named_before_anything_is_traced(calm, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    with pytest.raises(mrt.MrtError, match=r"pip install 'mrt-mitsuba\[denoise\]'"):
+        mrt.render(calm, denoise=True, spp=64, on_round=lambda round: pytest.fail("it traced"))
