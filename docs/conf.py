@@ -43,7 +43,6 @@ nb_execution_timeout = 1200  # seconds a cell: a busy machine fails nothing
 nb_merge_streams = True
 nb_render_markdown_format = "myst"  # with tables
 nb_output_stderr = "remove"  # bars of progress
-nb_mime_priority_overrides = [("html", "image/png", 0)]  # pictures as files of their own
 
 
 def generate(app: object) -> None:

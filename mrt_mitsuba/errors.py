@@ -14,20 +14,23 @@ NOT_INSTALLED = "{} is not installed: pip install 'mrt-mitsuba[{}]'"
 
 
 def printable(text: str) -> str:
-    """A text for people: no file's content in it can steer a terminal or flood it.
+    """Return a text on one line that can neither control a terminal nor flood it.
 
     Characters that do not print are escaped, line ends too; of a long text, start and end stay.
     """
     if len(text) > LONGEST:
         left_out = len(text) - LONGEST
         text = f"{text[: LONGEST * 3 // 4]} [... {left_out} characters ...] {text[-LONGEST // 4 :]}"
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return escaped(text)
+
+
+def escaped(text: str, keep: str = "") -> str:
+    """Return a text with escapes in place of characters that do not print, but for those to keep."""
+    return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode() for c in text)
 
 
 def one_line(text: str) -> str:
-    """A text of others for people, its lines joined."""
+    """Return third-party text as one printable line."""
     return printable(" ".join(text.split()))
 
 

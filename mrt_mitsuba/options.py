@@ -204,8 +204,8 @@ def check(name: str, kind: Kind, value: Any, *, text: bool = False) -> Any:
         raise UsageError(f"{name}={shown}: must be {kind.allowed}") from None
 
 
-def is_path(scene: object, ending: str) -> bool:
-    """Whether a scene is given as a path with this ending."""
+def is_path(scene: object, ending: str | tuple[str, ...]) -> bool:
+    """True if a scene is given as a path with this ending, or one of them."""
     return isinstance(scene, str | os.PathLike) and os.fspath(scene).lower().endswith(ending)
 
 

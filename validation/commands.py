@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mrt_mitsuba.command.registry import AT_LEAST
 from mrt_mitsuba.command.tools import read_toml
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError
 from mrt_mitsuba.options import NUMBER, SWITCH
@@ -14,7 +15,6 @@ from mrt_mitsuba.rendering.progress import TerminalProgress
 from mrt_mitsuba.validation.page import prepare_folder
 from mrt_mitsuba.validation.study import Bound
 
-AT_LEAST = ("psnr", "p_value")  # the limits of other measures are at most
 KEYS = ("reference", "cases", "shared", "repeats", "errors")  # of a file of cases
 
 
@@ -41,18 +41,21 @@ def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: s
     return int(not all(bound.holds for bound in bounds))
 
 
-def check(scene: str, *, out: str | None = None, quick: str = "0") -> int:
+def check(scene: int | str, *, out: str | None = None, quick: str = "0", **options: Any) -> int:
     """Check a scene; return 0 where every law holds, 1 where one does not."""
     from mrt_mitsuba.validation.laws.scene import check_scene
 
     settings = {
+        **options,
         "quick": checked("quick", SWITCH, quick, text=True),
         "progress": TerminalProgress(unit="plugin"),
     }
-    return int(not _found(check_scene, scene, settings, out, scene).passed)
+    return int(not _found(check_scene, scene, settings, out, str(scene)).passed)
 
 
-def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
+def error_vs_time(
+    scene: int | str, *, cases: str, out: str = "error-vs-time", params: Mapping[str, str] | None = None
+) -> int:
     """Measure the cases of a TOML file; return 0, or 1 where one of them failed."""
     from mrt_mitsuba.validation import work_precision
 
@@ -61,18 +64,21 @@ def error_vs_time(scene: str, *, cases: str, out: str = "error-vs-time") -> int:
     wrong += [f"no entry {name!r}" for name in KEYS[:2] if name not in settings]
     if wrong:
         raise UsageError(f"{cases} has {wrong[0]}: it holds {', '.join(KEYS)}")
+    if params:
+        shared = settings.setdefault("shared", {})
+        shared["params"] = {**shared.get("params", {}), **params}
     settings["progress"] = TerminalProgress(unit="render")
-    return int(bool(_found(work_precision.error_vs_time, scene, settings, out, scene, cases).failed))
+    return int(bool(_found(work_precision.error_vs_time, scene, settings, out, str(scene), cases).failed))
 
 
 def _found(
-    look: Callable[..., Any], scene: str, settings: dict[str, Any], out: str | None, *inputs: str
+    look: Callable[..., Any], scene: int | str, settings: dict[str, Any], out: str | None, *inputs: str
 ) -> Any:
     """Examine a scene, print the findings, and write their page into ``out``."""
     if out is not None:
         prepare_folder(Path(out), inputs=inputs)
     try:
-        found = look(int(scene) if scene.isdecimal() else scene, **settings)
+        found = look(scene, **settings)
     except SceneError as error:  # nothing was done
         raise UsageError(str(error)) from error
     print(found)

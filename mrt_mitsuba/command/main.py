@@ -10,10 +10,12 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from typing import Any, TextIO
 
-from mrt_mitsuba.command import registry
+from mrt_mitsuba import __version__
 from mrt_mitsuba.command.options import parse
-from mrt_mitsuba.errors import MrtError, UsageError, needs_extra, one_line
+from mrt_mitsuba.command.registry import HELP, commands, run
+from mrt_mitsuba.errors import MrtError, UsageError, escaped, needs_extra, one_line
 from mrt_mitsuba.files.replacing import discard_unfinished
 from mrt_mitsuba.interrupts import Terminated, ending_soon, leave_now
 
@@ -23,6 +25,19 @@ TERMINATED = 128 + signal.SIGTERM
 UNPRINTED = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 # An environment variable; set to anything, unexpected errors show where they came from
 TRACEBACK = "MRT_TRACEBACK"
+
+
+class PrintableStream:
+    """A text stream on which no name or content of a file can control the terminal."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        return self._stream.write(escaped(text, keep="\n"))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,14 +50,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     while (lowest := os.open(os.devnull, os.O_RDWR)) <= 2:
         setattr(sys, ("stdin", "stdout", "stderr")[lowest], os.fdopen(lowest, "w" if lowest else "r"))
     os.close(lowest)
-    with warnings.catch_warnings():
+    printed: Any = PrintableStream(sys.stdout)
+    with warnings.catch_warnings(), contextlib.redirect_stdout(printed):
         warnings.showwarning = lambda message, *place, **more: print(
             f"mrt: warning: {one_line(str(message))}", file=sys.stderr
         )
         code, problem = _guarded(words)
         if problem:
             print(f"mrt: {one_line(problem)}", file=sys.stderr)
-    picture = bool(words) and words[0] not in registry.ALL
+    picture = bool(words) and words[0] not in commands()
     if arguments is None and (picture or code in (INTERRUPTED, TERMINATED)):
         # the interpreter would wait for kernels that run, and take apart all that it has loaded
         leave_now(code)
@@ -82,11 +98,17 @@ def _dispatch(words: list[str]) -> int:
         sys.stderr.write(usage())
         return UsageError.exit_code
     name = words[0]
-    if name in registry.ALL:
-        return registry.run(name, words[1:])
+    known = commands()
+    if name in known:
+        return run(known[name], words[1:])
+    if name == "--version":
+        print(f"mrt-mitsuba {__version__}")
+        return 0
+    if not HELP.isdisjoint(words):
+        return run(known["help"], [])
     if name.isdecimal() and all("=" in word for word in words[1:]):
         raise UsageError(f"FILENAME is missing: write mrt FILENAME {name}, or mrt ./{name} for that name")
-    close = difflib.get_close_matches(name, registry.COMMANDS, n=1, cutoff=0.75)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
     if close and (len(words) == 1 or words[1].startswith("--")):  # which makes no sense as a render either
         raise UsageError(f"no command {name!r}: did you mean mrt {close[0]}, or mrt ./{name} for a picture?")
     options = parse(words)

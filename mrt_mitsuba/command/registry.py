@@ -1,141 +1,124 @@
-"""The sub-commands of ``mrt``: a row each, which is all that says what words a command takes."""
+"""The sub-commands of ``mrt``: an entry here, and the function that it names."""
 
 from __future__ import annotations
 
-import difflib
-import re
-from collections.abc import Iterable, Iterator, Sequence
+import sys
+from collections.abc import Sequence
 from importlib import import_module
-from typing import NamedTuple
+from typing import Protocol
 
-from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.command.options import add_options, add_scene, read_scene
+from mrt_mitsuba.command.parser import Parser
 from mrt_mitsuba.machine import check_start
+from mrt_mitsuba.scene.model import MODEL_OPTIONS
 
 TOOLS = "mrt_mitsuba.command.tools"
 CHECKS = "mrt_mitsuba.validation.commands"
+HELP = {"-h", "--help"}
+WITHOUT_MITSUBA = ("help", "scenes", "info")
+AT_LEAST = ("psnr", "p_value")  # limits that a measure must reach; it must not exceed the others
+LIMITS = ("mae", "rmse", "rel_mse", "display", "psnr", "largest", "flip", "p_value")
 
 
-class Command(NamedTuple):
-    """A sub-command. Its function raises ``MrtError`` and returns the exit code."""
+class Add(Protocol):
+    """Adds a sub-command: its name, its words, what it does, and "module:function"."""
 
-    form: str  #: its words as the help shows them
-    text: str  #: what it does
-    module: str
-    function: str  #: takes plain words in turn and the others by name, all as text
+    def __call__(self, name: str, words: str, text: str, function: str) -> Parser: ...
 
 
-COMMANDS = {
-    "help": Command(
-        form="",
-        text="print this text",
-        module=TOOLS,
-        function="show_help",
-    ),
-    "doctor": Command(
-        form="",
-        text="print versions, the LLVM in use, the variants; render a self-test",
-        module=TOOLS,
-        function="doctor",
-    ),
-    "scenes": Command(
-        form="",
-        text="list the scenes",
-        module=TOOLS,
-        function="show_scenes",
-    ),
-    "export": Command(
-        form="SCENE|scene=PATH --xml PATH [--stock] [name=value ...]",
-        text="write a scene as Mitsuba XML; --stock: with stock plugins only",
-        module=TOOLS,
-        function="export",
-    ),
-    "sweep": Command(
-        form="OUT FILE.toml [workers=N] [cluster=ADDRESS]",
-        text="render the grid in a file on several processes or machines",
-        module=TOOLS,
-        function="sweep",
-    ),
-    "diff": Command(
-        form="A.exr B.exr [layer=NAME] [mae|rmse|rel_mse|display|psnr|largest|flip|p_value=LIMIT] [out=PATH]",
-        text="compare two pictures; exit code 1 beyond a limit, 2 if they do not compare",
-        module=CHECKS,
-        function="diff",
-    ),
-    "check": Command(
-        form="SCENE|scene=PATH [out=DIR] [quick=1]",
-        text="check the laws of every BSDF, shape and emitter, and find pixels that are not finite",
-        module=CHECKS,
-        function="check",
-    ),
-    "error-vs-time": Command(
-        form="SCENE|scene=PATH cases=FILE.toml [out=DIR]",
-        text="measure error and time of any settings of any scene",
-        module=CHECKS,
-        function="error_vs_time",
-    ),
-}
-_VERSION = Command(form="", text="print the version", module=TOOLS, function="show_version")
-ALL = {**COMMANDS, "-h": COMMANDS["help"], "--help": COMMANDS["help"], "--version": _VERSION}
+def commands() -> dict[str, Parser]:
+    """Return the parsers of the sub-commands, by name."""
+    added = Parser(prog="mrt").add_subparsers(parser_class=Parser)
+
+    def command(name: str, words: str, text: str, function: str) -> Parser:
+        parser = added.add_parser(name, usage=f"mrt {name} {words}".strip(), description=text)
+        parser.set_defaults(run=function)
+        return parser
+
+    _add_tools(command)
+    _add_checks(command)
+    return dict(added.choices)
 
 
-def split(words: Iterable[str]) -> tuple[list[str], dict[str, str]]:
-    """Plain words, and those of the form ``name=value`` by name; each name may be given once."""
-    plain: list[str] = []
-    given: dict[str, str] = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if name in given:
-            raise UsageError(f"{name} is given twice")
-        if equals:
-            given[name] = value
-        else:
-            plain.append(word)
-    return plain, given
+def _add_tools(command: Add) -> None:
+    """Add the sub-commands that neither render one picture nor check."""
+    parser = command("help", "[COMMAND]", "print this text, or the help of a command", f"{TOOLS}:show_help")
+    parser.add_argument("command", metavar="COMMAND", nargs="?", help="name of a command")
+
+    about = "print versions, the LLVM in use, the variants; render a self-test"
+    command("doctor", "", about, f"{TOOLS}:doctor")
+    command("scenes", "", "list the numbered scenes", f"{TOOLS}:show_scenes")
+
+    parser = command("info", "FILE.exr", "print size, layers and header of an EXR", f"{TOOLS}:info")
+    parser.add_argument("file", metavar="FILE.exr", help="a picture")
+
+    words = "SCENE|scene=PATH --xml PATH [--stock] [name=value ...]"
+    parser = command("export", words, "write a scene as Mitsuba XML", f"{TOOLS}:export")
+    add_scene(parser)
+    parser.add_argument("--xml", metavar="PATH", required=True, help="file to write")
+    parser.add_argument("--stock", action="store_true", help="with Mitsuba's own plugins only")
+    add_options(parser, ("width", "height", "fresnel", *MODEL_OPTIONS))
+
+    about = "render the grid in a file on several processes or machines"
+    parser = command("sweep", "OUT FILE.toml [name=value ...]", about, f"{TOOLS}:sweep")
+    parser.add_argument("out", metavar="OUT", help="folder of the pictures and their table")
+    parser.add_argument("path", metavar="FILE.toml", help="scene, grid and options")
+    parser.option("workers", "N", "processes on this machine (default: one for each core)")
+    parser.option("cluster", "ADDRESS", "address of a Dask scheduler (default: this machine)")
+    add_options(parser, ["plugins"])
 
 
-def run(name: str, words: Sequence[str]) -> int:
-    """Import a command and run it with its words; return its exit code.
+def _add_checks(command: Add) -> None:
+    """Add the sub-commands that compare and check."""
+    about = "compare two pictures; exit code 1 beyond a limit, 2 if they do not compare"
+    parser = command("diff", "A.exr B.exr [name=value ...]", about, f"{CHECKS}:diff")
+    parser.add_argument("a", metavar="A.exr", help="a picture")
+    parser.add_argument("b", metavar="B.exr", help="the reference")
+    parser.option("layer", "NAME", "layer to compare (default: the picture)")
+    parser.option("out", "PATH", "picture of the difference to write (default: none)")
+    for name in LIMITS:
+        parser.option(name, "LIMIT", f"{'least' if name in AT_LEAST else 'largest'} {name} that passes")
 
-    Raises ``UsageError`` for words that its row does not have.
-    """
-    form, _, module, function = ALL[name]
-    usage = f"Usage: mrt {name} {form}".strip()
-    plain, given = split(_flags_as_values(words, form))
-    names = names_in(form)
-    for strange in given.keys() - set(names) if "name" not in names else ():
-        close = difflib.get_close_matches(strange, names, n=1)
-        hint = f", meant {close[0]}?" if close else "."
-        raise UsageError(f"unknown option {strange!r}{hint} {usage}")
-    if "scene" in given:  # in place of SCENE
-        plain.append(given.pop("scene"))
-    capitals = [word for word in form.replace("--xml PATH", "").split() if word[0].isupper()]
-    if len(plain) > len(capitals):
-        raise UsageError(f"unexpected argument {plain[len(capitals)]!r} after mrt {name}. {usage}")
-    missing = capitals[len(plain) :]
-    for key in re.findall(r"(?<!\S)(?:--)?([a-z_]+)[= ]", form):  # without brackets
-        if not given.get(key):
-            missing.append(f"--{key}" if f"--{key}" in form else key)
-    if missing:
-        raise UsageError(f"{missing[0]} is missing. {usage}")
-    if form or name == "doctor":  # the others do without Mitsuba
+    about = "check the laws of every BSDF, shape and emitter; find pixels that are not finite"
+    parser = command("check", "SCENE|scene=PATH [name=value ...]", about, f"{CHECKS}:check")
+    add_scene(parser)
+    parser.option("out", "DIR", "folder of the report to write (default: none)")
+    parser.option("quick", "1|0", "fewer samples (default: 0)")
+
+    words = "SCENE|scene=PATH cases=FILE.toml [name=value ...]"
+    about = "measure error and time of any settings of any scene"
+    parser = command("error-vs-time", words, about, f"{CHECKS}:error_vs_time")
+    add_scene(parser)
+    parser.option("cases", "FILE.toml", "settings to compare, and the reference", required=True)
+    parser.option("out", "DIR", "folder of the report to write (default: error-vs-time)")
+
+
+def import_plugins(names: Sequence[str]) -> None:
+    """Import the user's own plugins into the current variant of Mitsuba."""
+    if names:
+        from mrt_mitsuba import runtime, user_plugins
+
+        runtime.use()
+        user_plugins.load(names)
+
+
+def run(parser: Parser, words: Sequence[str]) -> int:
+    """Run a sub-command with its words; return its exit code. Raises ``UsageError`` for wrong words."""
+    if not HELP.isdisjoint(words):
+        sys.stdout.write(parser.format_help())
+        return 0
+    if "scene" in parser.forms:
+        values = read_scene(parser, words)
+        if values.get("scene", "") == "":
+            parser.error("SCENE or scene=PATH is missing")
+    else:
+        values, others = parser.read(words)
+        if others:
+            parser.unknown(min(others))
+    module, function = values.pop("run").split(":")
+    if parser.prog.split()[-1] not in WITHOUT_MITSUBA:
         check_start()
-    code: int = getattr(import_module(module), function)(*plain, **given)
+    if "scene" in values:
+        import_plugins(values.pop("plugins", ()))
+    code: int = getattr(import_module(module), function)(**values)
     return code
-
-
-def _flags_as_values(words: Sequence[str], form: str) -> Iterator[str]:
-    """The words with ``--name PATH`` and ``--name`` of a form as "name=PATH" and "name=1"."""
-    flags = re.findall(r"--\w+(?: PATH)?", form)
-    rest = iter(words)
-    for word in rest:
-        if f"{word} PATH" in flags:
-            yield f"{word[2:]}={next(rest, '')}"
-        elif word in flags:
-            yield f"{word[2:]}=1"
-        else:
-            yield word
-
-
-def names_in(form: str) -> list[str]:
-    """The names that a form has as ``name=value`` or ``--name``; "name" stands for any."""
-    return [flag or name for flag, name in re.findall(r"--(\w+)|\b([a-z_]+)(?=[a-z_|]*=)", form)]

@@ -10,6 +10,7 @@ import time
 import warnings
 
 from mrt_mitsuba.command.options import LEVELS, Options
+from mrt_mitsuba.command.registry import import_plugins
 from mrt_mitsuba.errors import MrtWarning, printable
 from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.interrupts import held
@@ -40,6 +41,7 @@ def run(options: Options) -> int:
         from mrt_mitsuba import runtime
 
         runtime.use(options.variant)
+        import_plugins(options.plugins)
         from mrt_mitsuba.rendering.api import render
     if spared:
         gc.freeze()
@@ -50,7 +52,7 @@ def run(options: Options) -> int:
     start = time.perf_counter()
     result = render(options.scene, progress=progress, **options.render_arguments())
     seconds = time.perf_counter() - start
-    result.save(*options.outputs(), tonemap=options.tonemap)
+    result.save(*options.outputs(), tonemap=options.tonemap, compression=options.compression)
     if not options.quiet:
         if result.error is not None:
             target = result.error.target

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import sys
-import textwrap
 import time
 from collections.abc import Iterator, Mapping
 from importlib import metadata
@@ -12,9 +11,10 @@ from typing import Any
 
 import mrt_mitsuba
 from mrt_mitsuba import llvm
-from mrt_mitsuba.command.options import TABLE, parse
-from mrt_mitsuba.command.registry import COMMANDS
-from mrt_mitsuba.errors import MrtError, SceneError, UsageError
+from mrt_mitsuba.command.options import checked, render_parser
+from mrt_mitsuba.command.registry import commands
+from mrt_mitsuba.errors import MrtError, SceneError, UsageError, printable
+from mrt_mitsuba.files.images import read_channels
 from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.scene.files import require_file
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
@@ -24,47 +24,21 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-WIDTH = 100  # characters of a line of help
-_COLUMN = 30  # where explanations start
-
 # ------------------------------------------- What only prints ------------------------------------------
 
 
 def usage() -> str:
-    """The help text of the command."""
-    options = {
-        f"{name}={field.metadata['kind'].form}": f"{field.metadata['help']} "
-        f"(default: {field.metadata['shown'] or field.default})"
-        for name, field in TABLE.items()
-    }
-    commands = {f"{name} {form}".strip(): text for name, (form, text, _, _) in COMMANDS.items()}
-    lines = [
-        "usage: mrt FILENAME [SCENE] [name=value ...]",
-        f"       mrt {' | '.join(COMMANDS)} ...",
-        "",
-        "Renders a scene and writes FILENAME.png and FILENAME.exr.",
-        f"FILENAME has no extension; SCENE is {NUMBERS[0]} to {NUMBERS[-1]} (default: 0).",
-    ]
-    for title, entries in (("options", options), ("commands", commands)):
-        lines += ["", f"{title}:"]
-        for form, text in entries.items():
-            if len(form) > _COLUMN - 3:
-                lines.append(f"  {form}")
-                form = ""
-            entry = f"{form:<{_COLUMN - 3}} {text}"
-            lines += textwrap.wrap(entry, WIDTH, initial_indent="  ", subsequent_indent=" " * _COLUMN)
-    return "\n".join(lines) + "\n"
+    """Return the help text of the command."""
+    rows = "".join(f"  {name:<15} {parser.description}\n" for name, parser in commands().items())
+    return f"{render_parser().format_help()}\ncommands ('mrt COMMAND --help' says more):\n{rows}"
 
 
-def show_help() -> int:
-    """Print the help text."""
-    sys.stdout.write(usage())
-    return 0
-
-
-def show_version() -> int:
-    """Print the version of the package."""
-    print(f"mrt-mitsuba {mrt_mitsuba.__version__}")
+def show_help(command: str | None = None) -> int:
+    """Print the help text of ``mrt``, or of a sub-command."""
+    known = commands()
+    if command is not None and command not in known:
+        raise UsageError(f"no command {command!r}: choose one of {', '.join(known)}")
+    sys.stdout.write(known[command].format_help() if command else usage())
     return 0
 
 
@@ -110,20 +84,35 @@ def doctor() -> int:
     return 0
 
 
+def info(file: str) -> int:
+    """Print size, layers and header of an EXR."""
+    planes, headers = read_channels(file)
+    channel, plane = next(iter(planes.items()))
+    layers: dict[str, list[str]] = {}
+    for name in planes:
+        layer, _, letter = name.rpartition(".")
+        layers.setdefault(layer or "picture", []).append(letter)
+    print(f"{printable(file)}: {plane.shape[1]}x{plane.shape[0]} pixels, {len(planes)} channels")
+    rows = {layer: " ".join(letters) for layer, letters in layers.items()}
+    for title, entries in (("layers", rows), ("header", headers[channel])):
+        print(f"{title}:")
+        for name, value in entries.items():
+            if name != "channels":
+                value = [part.tolist() for part in value] if isinstance(value, tuple) else value
+                print(f"  {printable(name):<20} {printable(str(value))}")
+    return 0
+
+
 # ------------------------------------------- What writes files -----------------------------------------
 
 
-def export(place: str, /, *, xml: str, stock: str = "", **given: str) -> int:
-    """Write a scene, a number or the path of a file, as XML."""
-    scene_word = place if place.isdecimal() else f"scene={place}"
-    options = parse(["export", scene_word, *(f"{name}={text}" for name, text in given.items())])
+def export(scene: int | str, xml: str, stock: bool = False, **given: Any) -> int:
+    """Write a scene as XML."""
+    options = checked("export", {"scene": scene, **given})
+    if options.error:
+        raise UsageError("target is an error here, and a file holds none: give the point to look at, X,Y,Z")
     kept = {name: getattr(options, name) for name in ("width", "height", "fresnel", "params")}
     kept |= options.model()
-    strange = given.keys() - kept.keys() - (options.params or {}).keys()
-    if strange:  # about the render, which is not in the file
-        raise UsageError(
-            f"{min(strange)} is of no use to mrt export. Usage: mrt export {COMMANDS['export'].form}"
-        )
     from mrt_mitsuba.scene.export import write_xml
 
     check_target(xml, options.inputs())
@@ -132,7 +121,7 @@ def export(place: str, /, *, xml: str, stock: str = "", **given: str) -> int:
     return 0
 
 
-def sweep(out: str, path: str, *, workers: str | None = None, cluster: str | None = None) -> int:
+def sweep(out: str, path: str, *, workers: str | None = None, **given: Any) -> int:
     """Render the sweep that a TOML file describes; return 1 if a job failed."""
     settings = read_toml(path)
     refused = settings.keys() & {"out", "progress"}
@@ -141,8 +130,7 @@ def sweep(out: str, path: str, *, workers: str | None = None, cluster: str | Non
     count = int(workers) if workers and workers.isdecimal() else workers
     if count is not None:
         settings["workers"] = count
-    if cluster is not None:
-        settings["cluster"] = cluster
+    settings |= given
     grid = dict(_axes(settings.pop("grid", {})))
     scene = settings.pop("scene", None if "scene" in grid else 0)
     table = mrt_mitsuba.sweep(scene, out, grid=grid, **settings)

@@ -5,9 +5,8 @@ scene → plan → rays → integrator → filters → result: each step is a mo
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import html
+import json
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,8 +42,6 @@ LONGEST_ARRAY = 64  # entries of an array that the header of an EXR holds; large
 if TYPE_CHECKING:
     from mrt_mitsuba.adaptive.error import ErrorEstimate, Round, RoundPicture
     from mrt_mitsuba.adaptive.target import Target
-
-    OnRound = Callable[[RoundPicture], object]
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,7 @@ class Result:
             "software": f"mrt-mitsuba {version}",
             "mrt:version": version,
             "mrt:scene": self.plan.scene,
-            "mrt:options": as_json(self.options),
+            "mrt:options": json.loads(json.dumps(self.options, default=_plain)),
             "mrt:variant": self.plan.variant,
             **{f"mrt:{name}": self.versions[name] for name in ("mitsuba", "drjit", "llvm")},
             **estimated,
@@ -110,15 +107,18 @@ class Result:
         name = printable(self.plan.scene)
         return f"<Result of scene {name}: {width}x{height}{layers}{error}, {self.timings.total:.3g} s>"
 
-    def _repr_html_(self) -> str:
-        """Return the picture above what ``repr`` says."""
-        encoded = base64.b64encode(self._repr_png_()).decode()
-        caption = html.escape(repr(self))
-        return f'<figure><img src="data:image/png;base64,{encoded}" alt="{caption}">{caption}</figure>'
-
     def _repr_png_(self) -> bytes:
         """Return the picture as a notebook shows it, in sRGB as screens expect it."""
         return images.png(self.image)
+
+
+def _plain(value: Any) -> Any:
+    """Return an array, or a transform, as numbers, where they are few; else the name of a value's type."""
+    if not dr.is_array_v(value):  # else attributes are swizzles
+        value = getattr(value, "matrix", value)
+    array = np.asarray(value).squeeze()
+    few = array.size <= LONGEST_ARRAY and array.dtype.kind in "biuf"
+    return array.tolist() if few else f"<{type(value).__name__}>"
 
 
 def render(
@@ -194,22 +194,6 @@ if render.__doc__:  # None under ``python -OO``
     )
 
 
-def as_json(value: Any) -> Any:
-    """Return a value of an option as JSON can hold it: arrays as lists, other objects by the names of their
-    types."""
-    if isinstance(value, Mapping):
-        return {str(key): as_json(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [as_json(each) for each in value]
-    if value is None or isinstance(value, str | int | float):
-        return value
-    if not dr.is_array_v(value):  # of which attributes are swizzles
-        value = getattr(value, "matrix", value)
-    array = np.asarray(value).squeeze()
-    short = array.size <= LONGEST_ARRAY and array.dtype.kind in "biuf"
-    return array.tolist() if short else f"<{type(value).__name__}>"
-
-
 def refuse_freezing() -> None:
     """Raise ``UsageError`` inside a function that ``dr.freeze`` records."""
     if dr.flag(dr.JitFlag.FreezingScope):
@@ -219,24 +203,6 @@ def refuse_freezing() -> None:
         )
 
 
-def _keeping_variant(on_round: OnRound | None) -> OnRound | None:
-    """Return a callback that raises ``UsageError`` where the given one has changed Mitsuba's variant."""
-    if on_round is None:
-        return None
-
-    def checked(picture: RoundPicture) -> object:
-        variant = mi.variant()
-        answer = on_round(picture)
-        if mi.variant() != variant:
-            raise UsageError(
-                f"on_round changed Mitsuba's variant from {variant} to {mi.variant()}: change it after the "
-                "render, or back before on_round returns"
-            )
-        return answer
-
-    return checked
-
-
 @contextmanager
 def session(settings: RenderSettings) -> Iterator[Job]:
     """Let one render run alone, in the variant that the settings name, and measure what it costs."""
@@ -244,15 +210,23 @@ def session(settings: RenderSettings) -> Iterator[Job]:
     with runtime.one_at_a_time.lock, held(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         budget = Budget.of(settings.memory)
-        job = Job(settings.progress or default_progress(), budget, _keeping_variant(settings.on_round))
-        runtime.use(settings.variant)
+        job = Job(settings.progress or default_progress(), budget, settings.on_round)
+        variant = runtime.use(settings.variant)
         runtime.warn_if_slow()
-        yield job
+        try:
+            yield job
+        except Exception:
+            if mi.variant() != variant:
+                raise UsageError(
+                    f"Mitsuba's variant was changed from {variant} to {mi.variant()} during a render, by "
+                    "on_round or another callback: change it after the render, or back before it returns"
+                ) from None
+            raise
 
 
 def open_with(scene: Any, settings: RenderSettings, budget: Budget) -> Source:
     """Load a scene as the options of a render say; see ``render`` for what it may be."""
-    given = {
+    given: dict[str, Any] = {
         field.name: value if (value := getattr(settings, field.name)) is not field.default else None
         for field in dataclasses.fields(settings)
     }

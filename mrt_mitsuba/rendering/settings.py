@@ -193,7 +193,7 @@ class RenderSettings:
     seed: int = option(0, integer(0, 2**32 - 1), "seed where anything is random")
     integrator: Any = option(
         None,
-        ANYTHING,
+        ANYTHING._replace(form="NAME"),
         "name, dict or instance of an integrator; one that gives whole pictures only, such as ptracer, knows "
         "no layers, edges, motion or depth of field",
         "the scene's own",

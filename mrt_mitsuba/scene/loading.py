@@ -21,6 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from mrt_mitsuba.errors import SceneError, UsageError
@@ -205,7 +206,7 @@ def _converted(key: str, value: Any, kind: type, name: str) -> Any:
     try:
         if kind in (str, bool, int) and not isinstance(value, kind):
             raise TypeError
-        return kind(value)
+        return kind(value[0] if kind is float and dr.is_array_v(value) else value)
     except (TypeError, ValueError, RuntimeError):
         raise UsageError(f"{key}={value!r}: must be a {name}") from None
 

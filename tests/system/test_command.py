@@ -96,14 +96,40 @@ def test_doctor(mrt_command):
     assert "not installed" not in said
 
 
-def test_levels_log_more_and_more(mrt_command):
-    silent, info, debug = (
+def test_levels_log_more(mrt_command):
+    silent, info = (
         mrt_command("a", "0", "width=16", "height=12", "quiet=1", f"log={level}").stderr.splitlines()
-        for level in ("warn", "info", "debug")
+        for level in ("warn", "info")
     )
     assert not silent
     for what in ("scene 0 loaded in", "rendering: 192 pixels in", "kernels: compiled in", "wrote"):
         assert sum(what in line for line in info) >= 1
     assert sum("wrote" in line for line in info) == 2  # PNG and EXR
-    assert any("rays, at most" in line for line in debug)
-    assert not any("rays, at most" in line for line in info)
+
+
+def test_info_and_plugins_of_a_file(mrt_command, run_command, tmp_path):
+    """``python -m mrt_mitsuba`` is the command; names in files cannot control the terminal."""
+    (tmp_path / "mine.py").write_text(
+        "import mitsuba as mi\n"
+        "class Mine(mi.Texture):\n"
+        "    def eval(self, si, active=True): return mi.Color3f(0.25)\n"
+        "    def to_string(self): return 'Mine'\n"
+        "mi.register_texture('mine', lambda props: Mine(props))\n"
+    )
+    (tmp_path / "mitsuba.py").write_text("raise RuntimeError('of the working folder')\n")
+    (tmp_path / "a.xml").write_text(
+        "<scene version='3.0.0'><integrator type='aov'><string name='aovs' value='a\x9b31m:depth'/>"
+        "<integrator type='direct'/></integrator><sensor type='perspective'/><emitter type='constant'/>"
+        "<shape type='sphere'><transform name='to_world'><translate z='5'/></transform>"
+        "<bsdf type='diffuse'><texture type='mine' name='reflectance'/></bsdf></shape></scene>"
+    )
+    mrt_command("out", "a.xml", "width=16", "height=16", "aa=1", "plugins=./mine.py", "format=exr")
+    assert_allclose(read_exr(tmp_path / "out.exr").image[8, 8], 0.25, atol=0.1)
+    (tmp_path / "mitsuba.py").unlink()
+    done = run_command(sys.executable, "-m", "mrt_mitsuba", "info", "out.exr")
+    assert done.stdout.startswith("out.exr: 16x16 pixels, ")
+    assert "mrt:options" in done.stdout
+    assert all(c.isprintable() or c == "\n" for c in done.stdout)
+    assert "\\x9b31m" in done.stdout
+    done = mrt_command("check", "a.xml", "plugins=./mine.py", "quick=1", code=None)
+    assert "Traceback" not in done.stderr

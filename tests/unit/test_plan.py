@@ -113,6 +113,7 @@ VALUES = {
     "metric": "display",
     "denoise": True,
     "maxspp": 64,
+    "integrator": "path",
     "maxseconds": 60,
     "lattice": "centered",
     "fresnel": "dielectric",
