@@ -152,7 +152,7 @@ class Shader:
             self.name = integrator.plugin_name
             self.facts = self._data.facts
             self.kernel = self._data.plan
-            self.random = self.kernel.random
+            self.random = self.facts.random_lights > 0
             self.layers |= integrator.provided_layers
         else:
             if self._derivatives:

@@ -124,7 +124,6 @@ def _read_materials(snapshot: Snapshot) -> tuple[list[np.ndarray], dict[str, Any
         "mirrors": tuple(mirrors),
         "oriented": any(map(is_oriented, bsdfs)),
         "textured": bool(unmergeable) and any(map(is_textured, bsdfs)),
-        "two_sided": any(mi.has_flag(b.flags(), mi.BSDFFlags.BackSide) for b in bsdfs),
         "unmergeable": unmergeable,
     }
     return rows, facts

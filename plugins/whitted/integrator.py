@@ -226,7 +226,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             "bounces": mi.UInt32(0),  # mirror rays traced
             "shadow_rays": mi.UInt32(0),  # shadow rays traced
             "active": mi.Bool(active),  # paths that go on
-            "sampler": sampler if data.plan.random else None,  # for lights that are no points
+            "sampler": sampler if data.facts.random_lights else None,  # for lights that are no points
         }
         # The camera ray, which the layers look at, comes before the loop
         state, hit = follow(state, data.eye)
@@ -272,7 +272,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             return black, mi.UInt32(0), no_mirror, mi.UInt32(0), sampler
 
         # A branch, because packets whose rays all miss are many
-        state = hit, throughput, sampler if data.plan.random else None
+        state = hit, throughput, sampler if data.facts.random_lights else None
         shade = partial(self._shade_surface, data)
         radiance, *others, _ = dr.if_stmt(state, hit.found, shade, pass_by, label="surface")
         if data.plan.sky != "none":
@@ -295,7 +295,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         si = hit.si
         radiance = mi.UnpolarizedSpectrum(0)
         shadow_rays = mi.UInt32(0)
-        emitter = si.emitter(data.scene, hit.found) if plan.emission else None
+        emitter = si.emitter(data.scene, hit.found) if data.facts.surface_emitters else None
         if emitter is not None:  # as it is of most surfaces in scalar variants
             radiance += mi.unpolarized_spectrum(emitter.eval(si, hit.found))
 
@@ -306,15 +306,13 @@ class MrtWhitted(mi.SamplingIntegrator):
             and the mirror reflectance and its index of refraction, which come from the same call."""
             samples = []
             wos = []
-            facing = []  # is the light on the lit side
+            facing = []  # is there a direction to the light
             for light in lights:
-                u = sampler.next_2d(hit.found) if plan.random else mi.Point2f(0.5)
+                u = sampler.next_2d(hit.found) if data.facts.random_lights else mi.Point2f(0.5)
                 ds, arriving = data.lights.sample(light, si, u, hit.found)
                 samples.append((light, ds, mi.unpolarized_spectrum(arriving)))
                 wos.append(si.to_local(ds.d))
                 facing.append(hit.found & (ds.pdf > 0))
-                if not plan.two_sided:
-                    facing[-1] &= mi.Frame3f.cos_theta(wos[-1]) > 0
             bsdf_values, *of_mirror = data.eval_bsdf(hit, wos, facing, mirror)
             for (light, ds, arriving), lit, bsdf_value in zip(samples, facing, bsdf_values, strict=True):
                 value = arriving * bsdf_value
@@ -339,7 +337,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             unrolled, radiance, shadow_rays, sampler, plan.mirrors
         )
         if plan.lights in ("loop", "table"):
-            state = mi.UInt32(0), radiance, shadow_rays, sampler if plan.random else None
+            state = mi.UInt32(0), radiance, shadow_rays, sampler if data.facts.random_lights else None
             _, radiance, shadow_rays, sampler = dr.while_loop(state, is_left, add_next, label="lights")
         cost = mi.UInt32(1)
         if self.bounce_budget == "report":

@@ -64,7 +64,6 @@ class SceneFacts:
     mirrors: tuple[Mirror, ...]  #: of the materials that reflect like a mirror
     oriented: bool  #: does a material depend on tangents
     textured: bool  #: does a material vary over its surface
-    two_sided: bool  #: is a material lit from behind
     unmergeable: str  #: why the materials have no place in one table; "" where they do
     differentiated: bool  #: are derivatives wanted
 
@@ -86,14 +85,9 @@ class KernelPlan:
     planes: bool  #: analytic planes, else they are traced as meshes
     buffers: bool  #: lists of what may be in the way of a light, in place of a search
     eye: bool  #: lists of the quadrics that the camera may see, in place of a search
-    random: bool  #: random numbers
-    emission: bool  #: surfaces that emit
     sky: str  #: "none", "parameter" or "environment"
-    textures: bool  #: texture coordinates
-    shading_frames: bool  #: interpolated normals
     tangents: bool  #: derivatives of the surface by uv, and frames along them
     merged: bool  #: one BSDF with a table of materials, in place of a call to each
-    two_sided: bool  #: light from behind a surface
     reasons: tuple[tuple[str, str], ...] = ()  #: what was left out, and why, in words
 
     def reason(self, name: str) -> str | None:
@@ -321,16 +315,6 @@ def _eye(case: Case) -> Decision:
     )
 
 
-@rule("random", "random numbers", "random numbers")
-def _random(case: Case) -> Decision:
-    return unless({"every light is a point or a direction": case.facts.random_lights == 0})
-
-
-@rule("emission", "emission", "emission of surfaces")
-def _emission(case: Case) -> Decision:
-    return unless({"no surface emits": case.facts.surface_emitters == 0})
-
-
 _SKY: Content = {"parameter": "the integrator's sky", "environment": "the scene's sky"}
 
 
@@ -342,16 +326,6 @@ def _sky(case: Case) -> Decision:
     return source, {"no sky in the scene": source == "none"}
 
 
-@rule("textures", "textures", "textures and their coordinates")
-def _textures(case: Case) -> Decision:
-    return unless({"every material is uniform": not case.facts.textured})
-
-
-@rule("shading_frames", "shading normals", "shading normals of meshes")
-def _shading_frames(case: Case) -> Decision:
-    return unless({"no mesh in the scene": case.facts.meshes == 0})
-
-
 @rule("tangents", "tangents", "tangents along texture coordinates")
 def _tangents(case: Case) -> Decision:
     return unless({"no material depends on the direction of texture coordinates": not case.facts.oriented})
@@ -360,11 +334,6 @@ def _tangents(case: Case) -> Decision:
 @rule("merged", "merged materials", "all materials as one, from a table")
 def _merged(case: Case) -> Decision:
     return unless({case.facts.unmergeable: bool(case.facts.unmergeable)})
-
-
-@rule("two_sided", "light from behind", "light from behind surfaces")
-def _two_sided(case: Case) -> Decision:
-    return unless({"no material is lit from behind": not case.facts.two_sided})
 
 
 #: What a decision is about, by its name

@@ -79,9 +79,8 @@ class SceneData:
         self.path_limit: Any = plan.cut_off[0]
         if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
             self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
-        self.ray_flags = +mi.RayFlags.dPdUV if plan.tangents else +mi.RayFlags.Minimal
-        self.ray_flags |= +mi.RayFlags.UV if plan.textures else 0
-        self.ray_flags |= +mi.RayFlags.ShadingFrame if plan.shading_frames else 0
+        self.ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
+        self.ray_flags |= +mi.RayFlags.dPdUV if plan.tangents else 0
 
     def arrays(self) -> list[Any] | None:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
@@ -144,7 +143,7 @@ class SceneData:
         if not self.plan.bvh and self.quadrics is None:
             return blocked
         # Lights that have a surface of their own are Mitsuba's
-        reach = 1 - (mi.math.ShadowEpsilon if self.plan.emission else TOUCHING)
+        reach = 1 - (mi.math.ShadowEpsilon if self.facts.surface_emitters else TOUCHING)
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
         for buffer, things in self.buffers:
             test = partial(things.block, ray=ray)

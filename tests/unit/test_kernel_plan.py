@@ -85,17 +85,12 @@ choice("planes", False, a=PLANE, b=SPHERE, light=LIGHT)
 choice("lights", "loop", same=True, a=SPHERE, light=LIGHT)
 choice("buffers", False, same=True, **CROWD, light=LIGHT)
 choice("eye", False, same=True, a=GROUP, light=LIGHT)
-choice("random", False, a=SPHERE, lamp=LAMP)
-choice("emission", False, a=SPHERE, lamp=LAMP)
 choice("sky", "none", a=SPHERE, sky=SKY, light=LIGHT)
 choice("mirrors", False, a=SPHERE, sky=SKY, light=LIGHT)
 choice("cut_off", (math.inf, 9.0), same=True, a=SPHERE, b=CONE, sky=SKY)
 choice("lobes", ("diffuse",), a=SPHERE, light=LIGHT)
-choice("textures", False, a=CHECKED_BALL, light=LIGHT)
-choice("shading_frames", False, a=SMOOTH, b=SPHERE, light=LIGHT)
 choice("tangents", False, a=BRUSHED_BALL, light=LIGHT)
 choice("merged", False, same=True, a=SPHERE, b=GLOSSY_CONE, light=LIGHT)
-choice("two_sided", False, same=True, a=GLASS, light=LIGHT)
 
 
 def test_every_decision_is_tried():
@@ -146,7 +141,6 @@ reason("spheres", "no sphere in the scene", a=MESH)
 reason("spheres", OTHER_SHAPES, a=SPHERE, b=MESH)
 reason("spheres", "a material needs the frame along texture coordinates", a=BRUSHED_BALL)
 reason("lights", "no light", a=SPHERE)
-reason("random", "every light is a point or a direction", a=SPHERE, light=LIGHT)
 reason("buffers", "few objects", a=SPHERE, light=LIGHT)
 reason("buffers", OTHER_LIGHT, **CROWD, light={"type": "point"})
 reason("buffers", OTHER_SHAPES, **CROWD, light=LIGHT, b=MESH)
@@ -158,7 +152,6 @@ reason("tangents", "no material depends on the direction of texture coordinates"
 reason("lobes", "no material has the specular one", a=MATTE_BALL)
 unbounded = "what may still arrive has no known bound"
 reason("cut_off", unbounded, a=SPHERE, b=CONE, lamp=LAMP, integrator=UNCLAMPED)
-reason("two_sided", "no material is lit from behind", a=SPHERE)
 INSTANCE = {"type": "instance", "of": {"type": "ref", "id": "inside"}}
 reason("merged", "instances in the scene", a=SPHERE, inside={"type": "shapegroup", "b": MESH}, c=INSTANCE)
 reason("merged", "a material other than mrt_bsdf", a={"type": "sphere"})

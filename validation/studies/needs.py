@@ -63,11 +63,7 @@ def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
         mirrors=True,
         lobes=tuple(name for name, _ in data.facts.lobes),
         bvh=True,
-        textures=True,
-        shading_frames=True,
         tangents=True,
-        emission=True,
-        two_sided=True,
     )
     integrator.kernel_plan = lambda facts: kernels
     return planned, whole
