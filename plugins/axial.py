@@ -46,7 +46,7 @@ class AxialMesh(mi.Mesh):
         buffers = {"has_vertex_normals": True, "has_vertex_texcoords": True}
         mi.Mesh.__init__(self, name, len(vertices), len(faces), props, **buffers)
         uvs = vertices[:, 6:].astype(np.float32).ravel()
-        write_buffers(self, vertex_texcoords=uvs, **self.table.stand_in())
+        write_buffers(self, vertex_texcoords=uvs, **self.table.proxy_mesh())
         parameters = dict(zip(self.ends, map(mi.Point3f, ends), strict=True))
         self.parameters = {**parameters, "radius": updatable(radius)}
         keep_apart(self, name)
@@ -64,7 +64,7 @@ class AxialMesh(mi.Mesh):
         """Return the unit frame with its derivatives; None where none are wanted."""
         return self._frame() if dr.grad_enabled(list(self.parameters.values())) else None
 
-    def looked_at(self) -> tuple[list, list, list]:
+    def snapshot_state(self) -> tuple[list, list, list]:
         """Return the state that a snapshot compares instead of all attributes: values, objects, arrays."""
         arrays = [*self.parameters.values(), self.vertex_positions_buffer(), self.faces_buffer()]
         return [self.kind], [self.table, self.placement], arrays
@@ -82,7 +82,7 @@ class AxialMesh(mi.Mesh):
             if is_jit():
                 self._follow(self._frame())
             else:
-                write_buffers(self, **self.table.stand_in())
+                write_buffers(self, **self.table.proxy_mesh())
         mi.Mesh.parameters_changed(self, keys)
 
     def _follow(self, frame: Frame) -> None:

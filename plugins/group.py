@@ -55,7 +55,7 @@ class MrtGroup(mi.Mesh):
         vertices, faces = map(len, unit)
         sizes = len(numbers) * vertices, len(numbers) * faces
         mi.Mesh.__init__(self, "mrt_group", *sizes, props, has_vertex_normals=True)
-        write_buffers(self, **self.table.stand_in())
+        write_buffers(self, **self.table.proxy_mesh())
         for name, values in attributes.items():
             if len(values) != len(numbers):
                 raise ParameterError(f'mrt_group: "{name}" has {len(values)} rows for {len(numbers)} objects')

@@ -289,7 +289,7 @@ class QuadricTable:
         numbers[:, 3, 3] = -1 if self.flipped else 1
         return numbers
 
-    def stand_in(self) -> dict[str, np.ndarray]:
+    def proxy_mesh(self) -> dict[str, np.ndarray]:
         """Return the buffers of a mesh of all objects; frames may be left-handed."""
         columns = np.linalg.inv(self.rows).transpose(0, 2, 1)
         vertices, faces = self.unit

@@ -19,18 +19,18 @@ import numpy as np
 from .tables import aligned
 
 # With more cells, or more objects in all of them, lists would take more memory and time than they save
-MOST_CELLS = 2**21
-MOST_LISTED = 2**22
+MAX_CELLS = 2**21
+MAX_ENTRIES = 2**22
 
 # Tangents of directions in float32 are off by less; so are places in cells
-_OFF_TANGENT = 4e-6
-_OFF_CELL = 1e-3
+_TANGENT_MARGIN = 4e-6
+_CELL_MARGIN = 1e-3
 
 # Rays from a point miss it in float32 by less than this share of the coordinates
-_OFF_PLACE = 2.0**-21
+_POSITION_MARGIN = 2.0**-21
 
 # A ray to a light may be taken for shorter than it is by less than this share
-_SHORT = 2.0**-9
+_LENGTH_MARGIN = 2.0**-9
 
 
 class PointBuffer:
@@ -52,7 +52,7 @@ class PointBuffer:
         radius = 0.5 * np.diff(boxes, axis=1)[:, 0].min(axis=1)
         farthest = np.linalg.norm(middle - places[:, None], axis=2) + np.ptp(middle, axis=0).max()
         slack = np.sqrt(np.minimum(radius**2 + 2.0**-20 * farthest**2, 3 * radius**2)) - radius
-        slack = (slack + 2 * _OFF_PLACE * extent)[..., None]
+        slack = (slack + 2 * _POSITION_MARGIN * extent)[..., None]
         low = boxes[:, 0] - places[:, None] - slack
         high = boxes[:, 1] - places[:, None] + slack
         columns = zip(*(_seen(low, high, side, balls) for side in range(6)), strict=True)
@@ -64,12 +64,12 @@ class PointBuffer:
         start, end = (np.where(start <= end, x, 0).astype(np.float32).astype(float) for x in (start, end))
         while True:
             scale = np.divide(size, end - start, out=np.zeros_like(start), where=end > start)
-            least = (first - start[face]) * scale[face] - _OFF_CELL
-            most = (last - start[face]) * scale[face] + _OFF_CELL
+            least = (first - start[face]) * scale[face] - _CELL_MARGIN
+            most = (last - start[face]) * scale[face] + _CELL_MARGIN
             least, most = np.clip(np.floor([least, most]), 0, size - 1).astype(np.int64)
             width = most - least + 1
             areas = width.prod(axis=1)
-            if size == 2 or (faces * size**2 <= MOST_CELLS and areas.sum() <= MOST_LISTED):
+            if size == 2 or (faces * size**2 <= MAX_CELLS and areas.sum() <= MAX_ENTRIES):
                 break
             size //= 2
         pair = np.repeat(np.arange(len(areas)), areas)
@@ -92,7 +92,7 @@ class PointBuffer:
         self.starts = aligned(starts, np.uint32)
         self.size = dr.opaque(mi.UInt32, size)  # data: one kernel serves all places and sizes
         self.place = dr.opaque(mi.Point3f, places[0].tolist())
-        self.off = dr.opaque(mi.Float, _OFF_PLACE * extent)
+        self.off = dr.opaque(mi.Float, _POSITION_MARGIN * extent)
         dr.eval(self.starts, self.lists, self.faces)
 
     def any(
@@ -107,7 +107,7 @@ class PointBuffer:
         def visit(thing: mi.UInt32, state: tuple) -> tuple:
             return (dr.select(test(thing), -1, state[0]),)
 
-        reach = mi.Float(1 + _SHORT)
+        reach = mi.Float(1 + _LENGTH_MARGIN)
         (reach,) = self._walk(light, mi.Vector3f(0), -to_light, active, visit, (reach,))
         return reach < 0
 
@@ -196,8 +196,8 @@ def _seen(low: np.ndarray, high: np.ndarray, side: int, balls: bool) -> tuple[np
             root = radius * np.sqrt(square + along**2)
             first = np.fmax(first, (along * z - root) / square)
             last = np.fmin(last, (along * z + root) / square)
-    first -= _OFF_TANGENT
-    last += _OFF_TANGENT
+    first -= _TANGENT_MARGIN
+    last += _TANGENT_MARGIN
     seen = (far[..., 0] > 0) & ((first < 1) & (last > -1)).all(axis=2)
     point, thing = np.nonzero(seen)
     depth = near[seen][:, 0] * (1 - 2.0**-18)

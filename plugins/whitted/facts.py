@@ -13,14 +13,14 @@ from ..lobes import LOBES
 from ..parameters import ParameterError
 from ..variants import is_jit
 from .lights import brightness, light_rows
-from .materials import has_mirror, is_mrt_bsdf, is_oriented, is_textured, material_rows
+from .materials import has_mirror, is_anisotropic, is_mrt_bsdf, is_textured, material_rows
 from .plan import Mirror, SceneFacts
 from .shapes import is_sphere
 from .snapshot import Kept, Snapshot
 
 # Beyond these sizes, Embree's products of three lengths leave float32
-SMALLEST_MESH = 1e-8
-LARGEST_MESH = 1e10
+MIN_MESH_EXTENT = 1e-8
+MAX_MESH_COORDINATE = 1e10
 
 
 class Reading:
@@ -79,11 +79,11 @@ def _check_size(mesh: mi.Mesh) -> None:
     low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
     extent = (high - low).max()
     farthest = np.abs([low, high]).max()
-    fits = extent >= SMALLEST_MESH and farthest <= LARGEST_MESH
+    fits = extent >= MIN_MESH_EXTENT and farthest <= MAX_MESH_COORDINATE
     if np.isfinite(farthest) and extent > 0 and not fits:
         raise ParameterError(
             f'mrt_whitted: the mesh "{mesh.id()}" is {extent:.3g} across and reaches to {farthest:.3g}; rays '
-            f"meet meshes from {SMALLEST_MESH:g} to {LARGEST_MESH:g}: scale the scene"
+            f"meet meshes from {MIN_MESH_EXTENT:g} to {MAX_MESH_COORDINATE:g}: scale the scene"
         )
 
 
@@ -104,7 +104,7 @@ def _read_lights(
         "environment": environment is not None,
         "sky": 0.0 if environment is None else largest[id(environment)],
         "emission": max(surfaces, default=0.0),
-        "tabled": rows is not None,
+        "lights_tabulated": rows is not None,
     }
     return lights, rows, facts
 
@@ -112,18 +112,18 @@ def _read_lights(
 def _read_materials(snapshot: Snapshot) -> tuple[list[np.ndarray], dict[str, Any]]:
     """Return the materials as rows of a table, none where they have no place in one, and the facts."""
     bsdfs = snapshot.bsdfs
-    rows, unmergeable = material_rows(snapshot.shapes)
+    rows, merge_obstacle = material_rows(snapshot.shapes)
     # Kernels leave out lobes by their flags; materials outside the table may have any
     flags = {lobe.flag for k, lobe in enumerate(LOBES, start=1) if any(row[k].any() for row in rows)}
-    lobes = [(lobe.name, bool(unmergeable) or lobe.flag in flags) for lobe in LOBES]
+    lobes = [(lobe.name, bool(merge_obstacle) or lobe.flag in flags) for lobe in LOBES]
     mirrors = []
     for bsdf in filter(has_mirror, bsdfs):
         mirrors.append(bsdf.mirror_bound() if is_mrt_bsdf(bsdf) else Mirror(1.0, 1.0))
     facts = {
         "lobes": tuple(lobes),
         "mirrors": tuple(mirrors),
-        "oriented": any(map(is_oriented, bsdfs)),
-        "textured": bool(unmergeable) and any(map(is_textured, bsdfs)),
-        "unmergeable": unmergeable,
+        "anisotropic": any(map(is_anisotropic, bsdfs)),
+        "textured": bool(merge_obstacle) and any(map(is_textured, bsdfs)),
+        "merge_obstacle": merge_obstacle,
     }
     return rows, facts

@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from operator import itemgetter
+from operator import attrgetter
 from typing import Any
 
 import drjit as dr
@@ -28,7 +28,7 @@ from .snapshot import Kept, Snapshot
 # over the report's scenes below 1e-5
 MIN_CONTRIBUTION = 1 / 16 / 255
 
-OUTLINES = (
+DISCONTINUITY_WARNING = (
     "mrt_whitted: derivatives by shapes leave out how outlines and the edges of shadows move. Of scenes that "
     "Mitsuba can trace as meshes, prb_projective and direct_projective have all of them."
 )
@@ -43,6 +43,29 @@ class Trace:
     hit: Hit  # of the camera ray
     bounces: mi.UInt32  # mirror rays traced
     shadow_rays: mi.UInt32  # shadow rays traced
+
+
+@dataclass
+class Path:
+    """Paths along mirror rays, one for each camera ray: the state of the loop over bounces."""
+
+    ray: mi.Ray3f  # the next to be traced
+    throughput: mi.UnpolarizedSpectrum  # product of the mirror reflectances so far
+    radiance: mi.UnpolarizedSpectrum  # light found so far
+    depth: mi.UInt32  # cost of the bounces so far
+    bounces: mi.UInt32  # mirror rays traced
+    shadow_rays: mi.UInt32  # shadow rays traced
+    active: mi.Bool  # paths that go on
+    sampler: mi.Sampler | None  # for lights that are no points
+
+
+@dataclass
+class Sums:
+    """Sums over the lights at a hit: the state of the loop over them."""
+
+    radiance: mi.UnpolarizedSpectrum
+    shadow_rays: mi.UInt32
+    sampler: mi.Sampler | None
 
 
 class MrtWhitted(mi.SamplingIntegrator):
@@ -164,7 +187,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         self._snapshot = Snapshot(scene, self._snapshot)
         if self._snapshot.shape_part.differentiated and not self._warned:
             self._warned = True
-            mi.Log(mi.LogLevel.Warn, OUTLINES)
+            mi.Log(mi.LogLevel.Warn, DISCONTINUITY_WARNING)
         reading = Reading(self._snapshot, self._made)
         return SceneData(scene, reading, plan or self.kernel_plan(reading.facts), self._made)
 
@@ -192,158 +215,153 @@ class MrtWhitted(mi.SamplingIntegrator):
             raise described from error
 
     def _trace(self, data: SceneData, sampler: mi.Sampler | None, ray: mi.Ray3f, active: mi.Bool) -> Trace:
-        def follow(s: dict, eye: PointBuffer | None = None) -> tuple[dict, Hit]:
-            """Trace the next ray of each path."""
-            hit = data.intersect(s["ray"], s["active"], eye)
-            radiance, shadow_rays, reflectance, cost = self._shade(
-                data, s["sampler"], s["ray"], hit, s["throughput"], s["active"]
-            )
-            # Finite, as an infinite one times no light would be NaN
-            throughput = dr.minimum(s["throughput"] * reflectance, LARGEST)
-            depth = s["depth"] + cost
-            affordable = depth < self.max_depth
-            brightest = dr.max(throughput)
-            if data.plan.cut_off[0] == math.inf:
-                goes_on = affordable & (brightest > 0)
-            else:
-                goes_on = affordable & (brightest * data.path_limit > self.min_contribution)
-            return {
-                "radiance": s["radiance"] + s["throughput"] * radiance,
-                "throughput": throughput,
-                "ray": data.mirror_ray(s["ray"], hit),
-                "depth": depth,
-                "bounces": s["bounces"],
-                "shadow_rays": s["shadow_rays"] + shadow_rays,
-                "active": hit.found & goes_on,
-                "sampler": s["sampler"],
-            }, hit
-
-        state: dict[str, Any] = {
-            "radiance": mi.UnpolarizedSpectrum(0),  # light found so far
-            "throughput": mi.UnpolarizedSpectrum(1),  # product of the mirror reflectances along the path
-            "ray": ray,  # the next to be traced
-            "depth": mi.UInt32(0),  # cost of the bounces so far
-            "bounces": mi.UInt32(0),  # mirror rays traced
-            "shadow_rays": mi.UInt32(0),  # shadow rays traced
-            "active": mi.Bool(active),  # paths that go on
-            "sampler": sampler if data.facts.random_lights else None,  # for lights that are no points
-        }
+        path = Path(
+            ray,
+            throughput=mi.UnpolarizedSpectrum(1),
+            radiance=mi.UnpolarizedSpectrum(0),
+            depth=mi.UInt32(0),
+            bounces=mi.UInt32(0),
+            shadow_rays=mi.UInt32(0),
+            active=mi.Bool(active),
+            sampler=sampler if data.facts.random_lights else None,
+        )
         # The camera ray, which the layers look at, comes before the loop
-        state, hit = follow(state, data.eye)
-        direct = state["radiance"]
+        path, hit = self._follow(data, path, data.eye_buffer)
+        direct = path.radiance
         if data.plan.mirrors:
 
-            def bounce(s: dict) -> tuple[dict]:
-                after, _ = follow(s)
-                return (after | {"bounces": s["bounces"] + 1},)
+            def bounce(path: Path) -> tuple[Path]:
+                bounces = path.bounces + 1
+                path, _ = self._follow(data, path)
+                path.bounces = bounces
+                return (path,)
 
-            (state,) = dr.while_loop(
-                (state,),
-                itemgetter("active"),
+            (path,) = dr.while_loop(
+                (path,),
+                attrgetter("active"),
                 bounce,
                 label="mirror bounces",
                 # Derivatives are propagated backwards through as many, whose state is stored
                 max_iterations=self.max_depth if data.facts.differentiated else None,
             )
-        return Trace(state["radiance"], direct, hit, state["bounces"], state["shadow_rays"])
+        return Trace(path.radiance, direct, hit, path.bounces, path.shadow_rays)
+
+    def _follow(self, data: SceneData, path: Path, eye: PointBuffer | None = None) -> tuple[Path, Hit]:
+        """Trace the next ray of each path; return the paths after it, and its hit."""
+        hit = data.intersect(path.ray, path.active, eye)
+        radiance, shadow_rays, reflectance, cost = self._shade(data, path, hit)
+        # Finite, as an infinite one times no light would be NaN
+        throughput = dr.minimum(path.throughput * reflectance, LARGEST)
+        depth = path.depth + cost
+        brightest = dr.max(throughput)
+        if data.plan.contribution_bounds[0] == math.inf:
+            goes_on = (depth < self.max_depth) & (brightest > 0)
+        else:
+            goes_on = (depth < self.max_depth) & (brightest * data.path_bound > self.min_contribution)
+        after = Path(
+            data.mirror_ray(path.ray, hit),
+            throughput=throughput,
+            radiance=path.radiance + path.throughput * radiance,
+            depth=depth,
+            bounces=path.bounces,
+            shadow_rays=path.shadow_rays + shadow_rays,
+            active=hit.found & goes_on,
+            sampler=path.sampler,
+        )
+        return after, hit
 
     # ------------------------------------------- Shading -----------------------------------------------
 
     def _shade(
-        self,
-        data: SceneData,
-        sampler: mi.Sampler,
-        ray: mi.Ray3f,
-        hit: Hit,
-        throughput: mi.UnpolarizedSpectrum,
-        active: mi.Bool,
+        self, data: SceneData, path: Path, hit: Hit
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32]:
-        """Return the light that leaves ``hit`` back along ``ray``, or the sky; the number of shadow rays; and
-        the reflectance of the mirror ray and its cost in the bounce budget.
-
-        ``throughput`` is that of the path up to ``hit``.
+        """Return the light that leaves ``hit`` back along the ray of ``path``, or the sky; the number of
+        shadow rays; and the reflectance of the mirror ray and its cost in the bounce budget.
         """
-
-        def pass_by(hit: Hit, throughput: mi.UnpolarizedSpectrum, sampler: mi.Sampler) -> tuple:
-            # Dr.Jit writes results into what a branch returns, and runs branches anew for derivatives: two
-            # objects, made here
-            black = mi.UnpolarizedSpectrum(0)
-            no_mirror = mi.UnpolarizedSpectrum(0)
-            return black, mi.UInt32(0), no_mirror, mi.UInt32(0), sampler
-
-        # A branch, because packets whose rays all miss are many
-        state = hit, throughput, sampler if data.facts.random_lights else None
+        # A branch: in many packets every ray misses
+        state = hit, path.throughput, path.sampler
         shade = partial(self._shade_surface, data)
-        radiance, *others, _ = dr.if_stmt(state, hit.found, shade, pass_by, label="surface")
+        radiance, *others, _ = dr.if_stmt(state, hit.found, shade, _shade_nothing, label="surface")
         if data.plan.sky != "none":
             si = dr.zeros(mi.SurfaceInteraction3f)
-            si.wi = -ray.d
-            si.wavelengths = ray.wavelengths
-            away = but_not(active, hit.found)
+            si.wi = -path.ray.d
+            si.wavelengths = path.ray.wavelengths
+            away = but_not(path.active, hit.found)
             sky = self.sky if data.plan.sky == "parameter" else data.environment
             radiance += dr.select(away, mi.unpolarized_spectrum(sky.eval(si, away)), 0)
         return radiance, *others
 
     def _shade_surface(
-        self,
-        data: SceneData,
-        hit: Hit,
-        throughput: mi.UnpolarizedSpectrum,
-        sampler: mi.Sampler,
-    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32, mi.Sampler]:
+        self, data: SceneData, hit: Hit, throughput: mi.UnpolarizedSpectrum, sampler: mi.Sampler | None
+    ) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32, mi.Sampler | None]:
         plan = data.plan
         si = hit.si
-        radiance = mi.UnpolarizedSpectrum(0)
-        shadow_rays = mi.UInt32(0)
+        sums = Sums(mi.UnpolarizedSpectrum(0), mi.UInt32(0), sampler)
         emitter = si.emitter(data.scene, hit.found) if data.facts.surface_emitters else None
         if emitter is not None:  # as it is of most surfaces in scalar variants
-            radiance += mi.unpolarized_spectrum(emitter.eval(si, hit.found))
-
-        def add(
-            lights: Sequence[Any], radiance: Any, shadow_rays: Any, sampler: mi.Sampler, mirror: bool
-        ) -> tuple:
-            """Add the contributions of some lights, and the shadow rays traced for them. Return both sums,
-            and the mirror reflectance and its index of refraction, which come from the same call."""
-            samples = []
-            wos = []
-            facing = []  # is there a direction to the light
-            for light in lights:
-                u = sampler.next_2d(hit.found) if data.facts.random_lights else mi.Point2f(0.5)
-                ds, arriving = data.lights.sample(light, si, u, hit.found)
-                samples.append((light, ds, mi.unpolarized_spectrum(arriving)))
-                wos.append(si.to_local(ds.d))
-                facing.append(hit.found & (ds.pdf > 0))
-            bsdf_values, *of_mirror = data.eval_bsdf(hit, wos, facing, mirror)
-            for (light, ds, arriving), lit, bsdf_value in zip(samples, facing, bsdf_values, strict=True):
-                value = arriving * bsdf_value
-                if self.clamp:
-                    value = dr.clip(value, 0, 1)
-                share = dr.max(dr.abs(throughput * value))
-                traced = lit & (share * plan.cut_off[1] > self.min_contribution)
-                visible = but_not(lit, data.occluded(hit, light, ds, traced))
-                radiance = radiance + dr.select(visible, value, 0)
-                shadow_rays = shadow_rays + dr.select(traced, mi.UInt32(1), mi.UInt32(0))
-            return radiance, shadow_rays, *of_mirror
-
-        def add_next(light: mi.UInt32, radiance: Any, shadow_rays: Any, sampler: mi.Sampler) -> tuple:
-            radiance, shadow_rays, *_ = add([light], radiance, shadow_rays, sampler, mirror=False)
-            return light + 1, radiance, shadow_rays, sampler
-
-        def is_left(light: mi.UInt32, *_: object) -> mi.Bool:
-            return hit.found & (light < data.lights.count)
-
-        unrolled = range(data.lights.unrolled)
-        radiance, shadow_rays, reflectance, int_ior = add(
-            unrolled, radiance, shadow_rays, sampler, plan.mirrors
-        )
+            sums.radiance += mi.unpolarized_spectrum(emitter.eval(si, hit.found))
+        add = partial(self._add_lights, data, hit, throughput)
+        sums, reflectance, int_ior = add(range(data.lights.unrolled), sums, mirror=plan.mirrors)
         if plan.lights in ("loop", "table"):
-            state = mi.UInt32(0), radiance, shadow_rays, sampler if data.facts.random_lights else None
-            _, radiance, shadow_rays, sampler = dr.while_loop(state, is_left, add_next, label="lights")
+
+            def add_next(light: mi.UInt32, sums: Sums) -> tuple[mi.UInt32, Sums]:
+                return light + 1, add([light], sums, mirror=False)[0]
+
+            def is_left(light: mi.UInt32, sums: Sums) -> mi.Bool:
+                return hit.found & (light < data.lights.count)
+
+            _, sums = dr.while_loop((mi.UInt32(0), sums), is_left, add_next, label="lights")
         cost = mi.UInt32(1)
         if self.bounce_budget == "report":
             tenths = mi.Int32(dr.minimum(10 * int_ior, 10))
             cost = mi.UInt32(dr.maximum(10 - tenths, 1))
-        return radiance, shadow_rays, reflectance, cost, sampler
+        return sums.radiance, sums.shadow_rays, reflectance, cost, sums.sampler
+
+    def _add_lights(
+        self,
+        data: SceneData,
+        hit: Hit,
+        throughput: mi.UnpolarizedSpectrum,
+        lights: Sequence[Any],
+        sums: Sums,
+        *,
+        mirror: bool,
+    ) -> tuple[Sums, mi.UnpolarizedSpectrum, mi.Float]:
+        """Add the contributions of some lights, and the shadow rays traced for them.
+
+        Returns the sums, and the mirror reflectance and its index of refraction, which come from the same
+        call.
+        """
+        si = hit.si
+        samples = []
+        for light in lights:
+            u = sums.sampler.next_2d(hit.found) if data.facts.random_lights else mi.Point2f(0.5)
+            ds, arriving = data.lights.sample(light, si, u, hit.found)
+            samples.append((light, ds, mi.unpolarized_spectrum(arriving), hit.found & (ds.pdf > 0)))
+        wos = [si.to_local(ds.d) for _, ds, _, _ in samples]
+        facing = [lit for *_, lit in samples]
+        values, reflectance, int_ior = data.eval_bsdf(hit, wos, facing, mirror)
+        radiance = sums.radiance
+        shadow_rays = sums.shadow_rays
+        for (light, ds, arriving, lit), bsdf_value in zip(samples, values, strict=True):
+            value = arriving * bsdf_value
+            if self.clamp:
+                value = dr.clip(value, 0, 1)
+            share = dr.max(dr.abs(throughput * value))
+            traced = lit & (share * data.plan.contribution_bounds[1] > self.min_contribution)
+            visible = but_not(lit, data.occluded(hit, light, ds, traced))
+            radiance = radiance + dr.select(visible, value, 0)
+            shadow_rays = shadow_rays + dr.select(traced, mi.UInt32(1), mi.UInt32(0))
+        return Sums(radiance, shadow_rays, sums.sampler), reflectance, int_ior
+
+
+def _shade_nothing(
+    hit: Hit, throughput: mi.UnpolarizedSpectrum, sampler: mi.Sampler | None
+) -> tuple[mi.UnpolarizedSpectrum, mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32, mi.Sampler | None]:
+    # Dr.Jit writes results into what a branch returns, and runs branches anew for derivatives: two objects
+    black = mi.UnpolarizedSpectrum(0)
+    no_mirror = mi.UnpolarizedSpectrum(0)
+    return black, mi.UInt32(0), no_mirror, mi.UInt32(0), sampler
 
 
 def _plugin_error(error: BaseException) -> PluginError | None:

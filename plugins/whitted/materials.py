@@ -84,7 +84,7 @@ def is_textured(bsdf: mi.BSDF) -> bool:
     return any(varies(node) or not is_known(node) for node in mi.traverse(bsdf).hierarchy)
 
 
-def is_oriented(bsdf: mi.BSDF) -> bool:
+def is_anisotropic(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF depends on how the surface is turned about its normal."""
     if is_mrt_bsdf(bsdf):
         return False

@@ -16,14 +16,14 @@ import numpy as np
 from ..table import names_in
 
 # Up to this many lights the kernel holds the code of each; beyond, it loops over them
-UNROLLED_LIGHTS = 8
+MAX_UNROLLED_LIGHTS = 8
 
 # With fewer objects, looking up what is in the way of a light takes as long as searching for it; with more
 # pairs of an object and a light, the lists are too long for a processor's caches; with more objects than
-# ``MOST_SEEN``, those around the eye take longer to make than they save
-LEAST_BUFFERED = 64
-MOST_PAIRS = 2**17
-MOST_SEEN = 2**14
+# ``MAX_EYE_OBJECTS``, those around the eye take longer to make than they save
+MIN_BUFFERED_OBJECTS = 64
+MAX_LIGHT_OBJECT_PAIRS = 2**17
+MAX_EYE_OBJECTS = 2**14
 
 BUDGETS = ("report", "plain")
 
@@ -56,15 +56,15 @@ class SceneFacts:
     lights: int  #: emitters but for the environment and those that are black
     random_lights: int  #: lights that are no point and no direction
     surface_emitters: int  #: lights that are a surface
-    tabled: bool  #: do all lights have a place in a table
+    lights_tabulated: bool  #: do all lights have a place in a table
     environment: bool  #: is there an environment emitter
     sky: float  #: its largest radiance; 0 without one, inf where it is not known
     emission: float  #: the same of the surfaces
     lobes: tuple[tuple[str, bool], ...]  #: those of ``mrt_bsdf``, and whether a material may have them
     mirrors: tuple[Mirror, ...]  #: of the materials that reflect like a mirror
-    oriented: bool  #: does a material depend on tangents
+    anisotropic: bool  #: does a material depend on tangents
     textured: bool  #: does a material vary over its surface
-    unmergeable: str  #: why the materials have no place in one table; "" where they do
+    merge_obstacle: str  #: why the materials have no place in one table; "" where they do
     differentiated: bool  #: are derivatives wanted
 
 
@@ -78,13 +78,13 @@ class KernelPlan:
     lobes: tuple[str, ...]  #: of the materials, by name
     #: factors of a path's throughput (inf: it never ends for being too dim), and of a light's share at a hit,
     #: before these are compared with ``min_contribution``
-    cut_off: tuple[float, float]
+    contribution_bounds: tuple[float, float]
     bvh: bool  #: Mitsuba's ray queries
     coherent: bool  #: Embree's treatment of packets of like rays
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
     planes: bool  #: analytic planes, else they are traced as meshes
-    buffers: bool  #: lists of what may be in the way of a light, in place of a search
-    eye: bool  #: lists of the quadrics that the camera may see, in place of a search
+    light_buffers: bool  #: lists of what may be in the way of a light, in place of a search
+    eye_buffer: bool  #: lists of the quadrics that the camera may see, in place of a search
     sky: str  #: "none", "parameter" or "environment"
     tangents: bool  #: derivatives of the surface by uv, and frames along them
     merged: bool  #: one BSDF with a table of materials, in place of a call to each
@@ -95,7 +95,7 @@ class KernelPlan:
         return dict(self.reasons).get(name)
 
 
-class Tracer(Protocol):
+class IntegratorParams(Protocol):
     """The parameters of the integrator that a plan depends on."""
 
     max_depth: int
@@ -105,30 +105,30 @@ class Tracer(Protocol):
 
 
 @dataclass
-class Case:
+class PlanInput:
     """The ground for decisions: a scene, the integrator, and the decisions so far."""
 
     facts: SceneFacts
-    tracer: Tracer
+    integrator: IntegratorParams
     own_sky: float | None  # largest radiance of the integrator's ``sky``; None without one
-    made: dict[str, Any] = field(default_factory=dict)
+    decisions: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         facts = self.facts
         sky = facts.sky if self.own_sky is None else self.own_sky
         # A light counts for one, where its share is clamped to that, and the sky for one at least
-        lights = facts.lights if self.tracer.clamp or facts.lights == 0 else math.inf
+        lights = facts.lights if self.integrator.clamp or facts.lights == 0 else math.inf
         #: bounds the radiance from anywhere, but for what mirrors add; inf without bound
-        self.arriving = lights + max(1, sky) + facts.emission
+        self.radiance_bound = lights + max(1, sky) + facts.emission
         #: mirrors that the bounce budget admits
-        self.affordable = [m for m in facts.mirrors if self.cost(m) < self.tracer.max_depth]
+        self.affordable = [m for m in facts.mirrors if self.cost(m) < self.integrator.max_depth]
         self.lobes = tuple(name for name, present in facts.lobes if present)
         self.quadrics = sum(count for _, count in facts.quadrics)
         self.objects = facts.native_shapes + self.quadrics
 
     def cost(self, mirror: Mirror) -> int:
         """Return the cost of a bounce off a mirror, a part of ``max_depth``."""
-        if self.tracer.bounce_budget == "plain":
+        if self.integrator.bounce_budget == "plain":
             return 1
         return max(10 - int(np.float32(10) * np.float32(min(mirror.int_ior, 1))), 1)
 
@@ -150,7 +150,7 @@ class Rule:
     name: str  #: the field of the plan
     what: str  #: what is decided, in words
     content: Content
-    decide: Callable[[Case], Decision]
+    decide: Callable[[PlanInput], Decision]
 
 
 RULES: list[Rule] = []  #: in the order in which they are taken: later ones may ask for earlier decisions
@@ -158,10 +158,10 @@ RULES: list[Rule] = []  #: in the order in which they are taken: later ones may 
 
 def rule(
     name: str, what: str, content: Content
-) -> Callable[[Callable[[Case], Decision]], Callable[[Case], Decision]]:
+) -> Callable[[Callable[[PlanInput], Decision]], Callable[[PlanInput], Decision]]:
     """Put a decision into ``RULES``, by the function that takes it."""
 
-    def add(decide: Callable[[Case], Decision]) -> Callable[[Case], Decision]:
+    def add(decide: Callable[[PlanInput], Decision]) -> Callable[[PlanInput], Decision]:
         RULES.append(Rule(name, what, content, decide))
         return decide
 
@@ -184,13 +184,13 @@ _SPHERES: Content = {
 
 
 @rule("spheres", "table of spheres", _SPHERES)
-def _spheres(case: Case) -> Decision:
+def _spheres(case: PlanInput) -> Decision:
     facts = case.facts
     reasons = {
         "no sphere in the scene": facts.spheres == 0,
         SCALAR_VARIANT: not facts.vectorised,
         VARYING: facts.textured,
-        "a material needs the frame along texture coordinates": facts.oriented,
+        "a material needs the frame along texture coordinates": facts.anisotropic,
         _OTHERS: facts.plain_spheres < facts.native_shapes,
     }
     if not any(reasons.values()):
@@ -206,24 +206,24 @@ _LIGHTS: Content = {
 
 
 @rule("lights", "shadow rays", _LIGHTS)
-def _lights(case: Case) -> Decision:
+def _lights(case: PlanInput) -> Decision:
     facts = case.facts
     reasons = {"no light": facts.lights == 0, "every material is black": not case.lobes}
     if any(reasons.values()):
         return "none", reasons
     # Dr.Jit has no derivatives through a loop of such calls
-    if facts.lights <= UNROLLED_LIGHTS or not facts.vectorised or facts.differentiated:
+    if facts.lights <= MAX_UNROLLED_LIGHTS or not facts.vectorised or facts.differentiated:
         return "unrolled", reasons
-    return "table" if facts.tabled else "loop", reasons
+    return "table" if facts.lights_tabulated else "loop", reasons
 
 
 @rule("mirrors", "bounce loop", "mirror bounces")
-def _mirrors(case: Case) -> Decision:
-    brightest = max((m.reflectance for m in case.affordable), default=0.0) * case.arriving
+def _mirrors(case: PlanInput) -> Decision:
+    brightest = max((m.reflectance for m in case.affordable), default=0.0) * case.radiance_bound
     return unless(
         {
             "max_depth admits no mirror ray": bool(case.facts.mirrors) and not case.affordable,
-            "no material reflects visibly": not brightest > case.tracer.min_contribution,
+            "no material reflects visibly": not brightest > case.integrator.min_contribution,
         }
     )
 
@@ -233,42 +233,42 @@ def _lobe_content(facts: SceneFacts, plan: KernelPlan) -> str:
 
 
 @rule("lobes", "one of the lobes", _lobe_content)
-def _lobes(case: Case) -> Decision:
+def _lobes(case: PlanInput) -> Decision:
     missing = {f"no material has the {name} one": not present for name, present in reversed(case.facts.lobes)}
     return case.lobes, {"every material is black": not case.lobes, **missing}
 
 
-def _cut_off_content(facts: SceneFacts, plan: KernelPlan) -> str:
-    return "an end of paths too dim to be seen" if 0 < plan.cut_off[0] < math.inf else ""
+def _contribution_bounds_content(facts: SceneFacts, plan: KernelPlan) -> str:
+    return "an end of paths too dim to be seen" if 0 < plan.contribution_bounds[0] < math.inf else ""
 
 
-@rule("cut_off", "cut-off", _cut_off_content)
-def _cut_off(case: Case) -> Decision:
+@rule("contribution_bounds", "cut-off", _contribution_bounds_content)
+def _contribution_bounds(case: PlanInput) -> Decision:
     """Bound what may still arrive along a path, and what lights bring.
 
     Both bounds count the hits of a path, weighted by its throughput at normal incidence. It is one where
     materials reflect less than a half there: what is left out at further hits adds less than as much again.
     Where mirrors face each other, it adds up.
     """
-    mirrors = case.affordable if case.made["mirrors"] else []
+    mirrors = case.affordable if case.decisions["mirrors"] else []
     hits = 1.0
     reflectance = max((m.at_normal for m in mirrors if m.at_normal < math.inf), default=0.0)
     if reflectance > 0.5:
-        bounces = (case.tracer.max_depth - 2) // min(map(case.cost, mirrors)) + 1
+        bounces = (case.integrator.max_depth - 2) // min(map(case.cost, mirrors)) + 1
         hits = sum(min(reflectance, 1.0) ** k for k in range(max(bounces, 0) + 1))
-    along_path = case.arriving * hits if case.made["mirrors"] else 0.0
-    unbounded = case.made["mirrors"] and case.arriving == math.inf
+    along_path = case.radiance_bound * hits if case.decisions["mirrors"] else 0.0
+    unbounded = case.decisions["mirrors"] and case.radiance_bound == math.inf
     reasons = {"what may still arrive has no known bound": unbounded}
     return (along_path, case.facts.lights * hits), reasons
 
 
 @rule("bvh", "BVH", "{facts.native_shapes} shapes in Mitsuba's BVH")
-def _bvh(case: Case) -> Decision:
+def _bvh(case: PlanInput) -> Decision:
     return unless({"no shapes but analytic ones": case.facts.native_shapes == 0})
 
 
 @rule("coherent", "coherent packets", "coherent packets of rays")
-def _coherent(case: Case) -> Decision:  # it pays where there are thousands of triangles to meet
+def _coherent(case: PlanInput) -> Decision:  # it pays where there are thousands of triangles to meet
     return unless({"no mesh in the scene": case.facts.meshes == 0})
 
 
@@ -278,38 +278,38 @@ def _quadric_content(facts: SceneFacts, plan: KernelPlan) -> str:
 
 
 @rule("quadrics", "cones and cylinders", _quadric_content)
-def _quadrics(case: Case) -> Decision:
+def _quadrics(case: PlanInput) -> Decision:
     kinds = tuple(kind for kind, _ in case.facts.quadrics)
     return kinds, {"none in the scene": not kinds}
 
 
 @rule("planes", "planes", "{facts.planes} analytic planes")
-def _planes(case: Case) -> Decision:
+def _planes(case: PlanInput) -> Decision:
     return unless({"none in the scene": case.facts.planes == 0})
 
 
-@rule("buffers", "light buffers", "light buffers: what may be in the way of each light")
-def _buffers(case: Case) -> Decision:
+@rule("light_buffers", "light buffers", "light buffers: what may be in the way of each light")
+def _light_buffers(case: PlanInput) -> Decision:
     facts = case.facts
     return unless(
         {
-            "no light": case.made["lights"] == "none",
+            "no light": case.decisions["lights"] == "none",
             SCALAR_VARIANT: not facts.vectorised,
-            f"a light other than {names_in('lights')}, or one with derivatives": not facts.tabled,
-            _OTHERS: facts.native_shapes > 0 and case.made["spheres"] != "table",
-            "few objects": case.objects < LEAST_BUFFERED,
-            "too many lights and objects": case.objects * facts.lights > MOST_PAIRS,
+            f"a light other than {names_in('lights')}, or one with derivatives": not facts.lights_tabulated,
+            _OTHERS: facts.native_shapes > 0 and case.decisions["spheres"] != "table",
+            "few objects": case.objects < MIN_BUFFERED_OBJECTS,
+            "too many lights and objects": case.objects * facts.lights > MAX_LIGHT_OBJECT_PAIRS,
         }
     )
 
 
-@rule("eye", "lists around the eye", "lists around the eye: what its rays may meet")
-def _eye(case: Case) -> Decision:
+@rule("eye_buffer", "lists around the eye", "lists around the eye: what its rays may meet")
+def _eye_buffer(case: PlanInput) -> Decision:
     return unless(
         {
             SCALAR_VARIANT: not case.facts.vectorised,
-            "few cones and cylinders": case.quadrics < LEAST_BUFFERED,
-            "too many cones and cylinders": case.quadrics > MOST_SEEN,
+            "few cones and cylinders": case.quadrics < MIN_BUFFERED_OBJECTS,
+            "too many cones and cylinders": case.quadrics > MAX_EYE_OBJECTS,
             "the camera is no pinhole": not case.facts.pinhole,
         }
     )
@@ -319,7 +319,7 @@ _SKY: Content = {"parameter": "the integrator's sky", "environment": "the scene'
 
 
 @rule("sky", "sky", _SKY)
-def _sky(case: Case) -> Decision:
+def _sky(case: PlanInput) -> Decision:
     source = "environment" if case.facts.environment else "none"
     if case.own_sky is not None:
         source = "parameter"
@@ -327,32 +327,32 @@ def _sky(case: Case) -> Decision:
 
 
 @rule("tangents", "tangents", "tangents along texture coordinates")
-def _tangents(case: Case) -> Decision:
-    return unless({"no material depends on the direction of texture coordinates": not case.facts.oriented})
+def _tangents(case: PlanInput) -> Decision:
+    return unless({"no material depends on the direction of texture coordinates": not case.facts.anisotropic})
 
 
 @rule("merged", "merged materials", "all materials as one, from a table")
-def _merged(case: Case) -> Decision:
-    return unless({case.facts.unmergeable: bool(case.facts.unmergeable)})
+def _merged(case: PlanInput) -> Decision:
+    return unless({case.facts.merge_obstacle: bool(case.facts.merge_obstacle)})
 
 
 #: What a decision is about, by its name
 WHAT = {each.name: each.what for each in RULES}
 
 
-def make_plan(facts: SceneFacts, tracer: Tracer, own_sky: float | None) -> KernelPlan:
+def make_plan(facts: SceneFacts, integrator: IntegratorParams, own_sky: float | None) -> KernelPlan:
     """Decide what the kernels for a scene hold.
 
-    ``tracer`` has the integrator's parameters; ``own_sky`` is the largest radiance of its ``sky``: inf where
-    that is not known, None without one.
+    ``own_sky`` is the largest radiance of the integrator's ``sky``: inf where that is not known, None without
+    one.
     """
-    case = Case(facts, tracer, own_sky)
+    case = PlanInput(facts, integrator, own_sky)
     reasons = list[tuple[str, str]]()
     for each in RULES:
-        case.made[each.name], against = each.decide(case)
+        case.decisions[each.name], against = each.decide(case)
         valid = [why for why, holds in against.items() if holds]
         reasons += [(each.name, why) for why in valid[:1]]
-    return KernelPlan(**case.made, reasons=tuple(reasons))
+    return KernelPlan(**case.decisions, reasons=tuple(reasons))
 
 
 def contents(plan: KernelPlan, facts: SceneFacts) -> list[str]:

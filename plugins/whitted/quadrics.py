@@ -90,7 +90,7 @@ class Quadrics:
         t, _ = self._meet(leaf, ray)
         return t < ray.maxt
 
-    def put_into(
+    def fill_interaction(
         self,
         si: mi.SurfaceInteraction3f,
         ray: mi.Ray3f,

@@ -20,18 +20,18 @@ from .facts import Reading
 from .hit_errors import HitErrors
 from .lights import Lights
 from .materials import MaterialTable, has_mirror
-from .plan import KernelPlan
+from .plan import KernelPlan, SceneFacts
 from .quadrics import Quadrics
 from .shapes import Planes, Spheres
 from .snapshot import Kept
 
-# Shadow rays end this share of their way short of a light: one that lies on a surface shines to both sides
-TOUCHING = 2.0**-14
+# Relative shortening of shadow rays, so that a surface on which a light lies does not occlude it
+SHADOW_EPSILON = 2.0**-14
 
 PLUGINS = __name__.removesuffix("whitted.scene_data")  # how the names of our modules begin
 
-# Reach of a mirror ray: any number that float32 holds
-FARTHEST = 2.0**127
+# Length of a mirror ray: any number that float32 holds
+MAX_RAY_T = 2.0**127
 
 
 @dataclass
@@ -41,6 +41,17 @@ class Hit:
     si: mi.SurfaceInteraction3f
     found: mi.Bool
     error: mi.Float  # how far the point may be off the surface
+
+
+@dataclass
+class Traced:
+    """The shapes of a scene by who traces them."""
+
+    bvh: mi.Scene | None  # of shapes that only Mitsuba can trace; None where that is the scene itself
+    planes: Planes
+    quadrics: Quadrics | None
+    errors: HitErrors
+    spheres: Spheres | None
 
 
 class SceneData:
@@ -56,29 +67,22 @@ class SceneData:
         self.facts = reading.facts
         self.environment = now.environment
         self._kept = kept
+        self._shape_key = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
         self.known = now.material_part.known and now.light_part.known
-        self._form = form = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
-        # The shapes by who traces them; ``others``: a scene of those that only Mitsuba can, or None for all
-        traced = kept("traced", form, _trace, reading, plan)
-        others, self.planes, self.quadrics, self.errors, self.spheres = traced
-        self.bvh = others or scene
-        lit = now.light_part, plan.lights
-        self.lights = kept("lights", lit, Lights, reading.lights, reading.light_rows, plan.lights)
-        # Lists of the objects that may block each light, with the objects themselves, which test rays
-        things = [thing for thing in (self.quadrics, self.spheres) if thing is not None and plan.buffers]
-        places = np.array([row[0] for row in reading.light_rows or ()])
-        self.buffers = kept("buffers", (now.light_part, plan.buffers, *form), _buffers, places, things)
-        self.eye: PointBuffer | None = None
-        if plan.eye:
-            around = kept("eye", (now.eye, *form), _buffers, np.array([now.eye]), [self.quadrics])
-            self.eye = around[0][0]
-        self.merged: MaterialTable | None = None
-        if plan.merged:
-            of_materials = now.shape_part, now.material_part
-            self.merged = kept("merged", of_materials, MaterialTable, now.shapes, reading.materials)
-        self.path_limit: Any = plan.cut_off[0]
-        if is_jit() and self.path_limit not in (0, math.inf, self.facts.lights + 1):
-            self.path_limit = dr.opaque(mi.Float, self.path_limit)  # a brighter sky needs no new kernel
+        traced = kept("traced", self._shape_key, _trace, reading, plan)
+        self.bvh = traced.bvh or scene
+        self.planes = traced.planes
+        self.quadrics = traced.quadrics
+        self.errors = traced.errors
+        self.spheres = traced.spheres
+        self.lights = kept("lights", (now.light_part, plan.lights), _lights, reading, plan)
+        key = now.light_part, plan.light_buffers, *self._shape_key
+        self.light_buffers = kept("light buffers", key, _light_buffers, reading, plan, traced)
+        key = now.eye, plan.eye_buffer, *self._shape_key
+        self.eye_buffer = kept("eye buffer", key, _eye_buffer, reading, plan, traced)
+        key = now.shape_part, now.material_part, plan.merged
+        self.merged = kept("merged", key, _material_table, reading, plan)
+        self.path_bound = _path_bound(reading.facts, plan)
         self.ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
         self.ray_flags |= +mi.RayFlags.dPdUV if plan.tangents else 0
 
@@ -88,13 +92,13 @@ class SceneData:
         sky = self.environment
         if not self.known:
             return None
-        tabled = plan.merged and (plan.lights == "none" or self.facts.tabled)
-        tabled = tabled and (plan.spheres == "table" or not plan.bvh)
-        if not tabled or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
+        tabulated = plan.merged and (plan.lights == "none" or self.facts.lights_tabulated)
+        tabulated = tabulated and (plan.spheres == "table" or not plan.bvh)
+        if not tabulated or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
             return None
-        rays = self._kept("rays", self._form, _ray_arrays, self.bvh) if plan.bvh else []
+        rays = self._kept("rays", self._shape_key, _ray_arrays, self.bvh) if plan.bvh else []
         own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged]
-        return [*_arrays_in([*own, self.buffers, self.eye]), *rays, self.path_limit, sky]
+        return [*_arrays_in([*own, self.light_buffers, self.eye_buffer]), *rays, self.path_bound, sky]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
@@ -123,11 +127,11 @@ class SceneData:
             nearer = mi.Ray3f(ray.o, ray.d, reach, ray.time, ray.wavelengths)
             quadric = self.quadrics.intersect(nearer, active, eye)
             closer = active & (quadric[0] < reach)
-            scale = self.quadrics.put_into(si, ray, quadric, closer, scale, tangents=plan.tangents)
+            scale = self.quadrics.fill_interaction(si, ray, quadric, closer, scale, tangents=plan.tangents)
             found = found | closer
         if plan.planes:
             on_plane = but_not(on_plane, found)
-            scale = self.planes.put_into(si, ray, plane, on_plane, scale, tangents=plan.tangents)
+            scale = self.planes.fill_interaction(si, ray, plane, on_plane, scale, tangents=plan.tangents)
             found = found | on_plane
         si.sh_frame = _frame_along(si) if plan.tangents else mi.Frame3f(si.sh_frame.n)
         si.wi = si.to_local(-ray.d)
@@ -139,16 +143,16 @@ class SceneData:
         """Return whether anything blocks the segment from ``hit`` to the sample ``ds`` of a light."""
         o = self._off_surface(hit, ds.d)
         to_light = ds.p - o
-        blocked = self.planes.separate(o, o + to_light * (1 - TOUCHING))
+        blocked = self.planes.separate(o, o + to_light * (1 - SHADOW_EPSILON))
         if not self.plan.bvh and self.quadrics is None:
             return blocked
         # Lights that have a surface of their own are Mitsuba's
-        reach = 1 - (mi.math.ShadowEpsilon if self.facts.surface_emitters else TOUCHING)
+        reach = 1 - (mi.math.ShadowEpsilon if self.facts.surface_emitters else SHADOW_EPSILON)
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
-        for buffer, things in self.buffers:
+        for buffer, things in self.light_buffers:
             test = partial(things.block, ray=ray)
             blocked |= buffer.any(light, to_light, but_not(active, blocked), test)
-        if self.buffers:
+        if self.light_buffers:
             return blocked
         if self.plan.bvh:
             blocked |= self.bvh.ray_test(ray, self.plan.coherent, but_not(active, blocked))
@@ -160,7 +164,7 @@ class SceneData:
         """Return the ray reflected at ``hit``."""
         n = hit.si.sh_frame.n
         d = ray.d - 2 * dr.dot(ray.d, n) * n
-        return mi.Ray3f(self._off_surface(hit, d), d, FARTHEST, ray.time, ray.wavelengths)
+        return mi.Ray3f(self._off_surface(hit, d), d, MAX_RAY_T, ray.time, ray.wavelengths)
 
     @staticmethod
     def _off_surface(hit: Hit, d: mi.Vector3f) -> mi.Point3f:
@@ -197,7 +201,7 @@ def context_of(lobes: Sequence[str]) -> mi.BSDFContext:
     return context
 
 
-def _trace(reading: Reading, plan: KernelPlan) -> tuple:
+def _trace(reading: Reading, plan: KernelPlan) -> Traced:
     """Sort the shapes by who traces them."""
     exact = [s for s in reading.quadrics if s.table.kind in plan.quadrics]
     planes = reading.planes if plan.planes else []
@@ -216,13 +220,38 @@ def _trace(reading: Reading, plan: KernelPlan) -> tuple:
         for thing, name in zip(things, names, strict=True):
             thing.set_id(name)
     spheres = Spheres(others) if plan.spheres != "none" else None
-    return bvh, Planes(planes), Quadrics(exact) if exact else None, HitErrors(others), spheres
+    return Traced(bvh, Planes(planes), Quadrics(exact) if exact else None, HitErrors(others), spheres)
 
 
-def _buffers(places: np.ndarray, things: list[Any]) -> list[tuple[PointBuffer, Any]]:
-    """Return for each of ``things``, such as ``Spheres``, lists of its objects as seen from places [m, 3],
-    and the thing itself."""
-    return [(PointBuffer(places, *thing.boxes()), thing) for thing in things]
+def _lights(reading: Reading, plan: KernelPlan) -> Lights:
+    return Lights(reading.lights, reading.light_rows, plan.lights)
+
+
+def _light_buffers(reading: Reading, plan: KernelPlan, traced: Traced) -> list[tuple[PointBuffer, Any]]:
+    """Return lists of the objects that may block each light, with the objects, which test rays."""
+    if not plan.light_buffers:
+        return []
+    positions = np.array([row[0] for row in reading.light_rows or ()])
+    things = [thing for thing in (traced.quadrics, traced.spheres) if thing is not None]
+    return [(PointBuffer(positions, *thing.boxes()), thing) for thing in things]
+
+
+def _eye_buffer(reading: Reading, plan: KernelPlan, traced: Traced) -> PointBuffer | None:
+    """Return lists of the quadrics that the camera may see."""
+    if not plan.eye_buffer or traced.quadrics is None:
+        return None
+    return PointBuffer(np.array([reading.snapshot.eye]), *traced.quadrics.boxes())
+
+
+def _material_table(reading: Reading, plan: KernelPlan) -> MaterialTable | None:
+    return MaterialTable(reading.snapshot.shapes, reading.materials) if plan.merged else None
+
+
+def _path_bound(facts: SceneFacts, plan: KernelPlan) -> Any:
+    """Return the bound of what a path may still bring, as data: a brighter sky needs no new kernel."""
+    bound = plan.contribution_bounds[0]
+    fixed = bound in (0, math.inf, facts.lights + 1)
+    return bound if fixed or not is_jit() else dr.opaque(mi.Float, bound)
 
 
 def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:

@@ -53,7 +53,7 @@ class Planes:
             blocked |= _height(p, *equation) * _height(q, *equation) < 0
         return blocked
 
-    def put_into(
+    def fill_interaction(
         self,
         si: mi.SurfaceInteraction3f,
         ray: mi.Ray3f,

@@ -29,7 +29,7 @@ from .. import is_known, plugin
 from ..variants import is_jit
 
 Value = TypeVar("Value")
-MOST_NOTED = 2**16  # objects of which it is known when they were updated
+MAX_TRACKED = 2**16  # objects of which it is known when they were updated
 PLAIN = (bool, int, float, str, bytes, type(None))
 
 
@@ -42,7 +42,7 @@ class Updates:
 
     def note(self, thing: Any) -> None:
         """Take note that an object was updated."""
-        if len(self._last) >= MOST_NOTED:  # from now on all look as if they had been updated
+        if len(self._last) >= MAX_TRACKED:  # from now on all look as if they had been updated
             self._forgotten = self._count = self._count + 1
             self._last.clear()
         self._count += 1
@@ -61,7 +61,7 @@ class Part:
     """Some objects with their textures and the like, as they are; equal to itself only."""
 
     state: list[Any] = field(default_factory=list)  # what is compared
-    steady: bool = True  # can a look tell that nothing has changed
+    comparable: bool = True  # can a look tell that nothing has changed
     known: bool = True  # Mitsuba or this project has the classes of all objects
     differentiated: bool = False  # are derivatives wanted
     _held: dict[int, Any] = field(default_factory=dict)  # objects, by id
@@ -74,9 +74,9 @@ class Part:
             return
         self._held[id(thing)] = thing
         if not (is_known(thing) or isinstance(thing, mi.Shape)):  # all that is read of shapes is in arrays
-            self.known = self.steady = False
+            self.known = self.comparable = False
         if is_jit() and isinstance(thing, plugin("axial").AxialMesh):  # many are looked at in less time
-            plain, things, arrays = thing.looked_at()
+            plain, things, arrays = thing.snapshot_state()
             self.state += *plain, *map(id, things)
             self._held |= {id(x): x for x in things}
             self._arrays += arrays
@@ -114,12 +114,12 @@ class Part:
     def close(self, before: Part | None) -> Part:
         """Return the part from ``before`` if nothing has changed since, else this one."""
         self.differentiated = dr.grad_enabled(self._arrays)
-        self.steady = self.steady and not self.differentiated
+        self.comparable = self.comparable and not self.differentiated
         self.state += dr.detail.collect_indices(self._arrays)
-        if before is not None and self.steady and before.steady and self.state == before.state:
+        if before is not None and self.comparable and before.comparable and self.state == before.state:
             return before
         # An object shows its arrays themselves; copies share the numbers, and stay as they are
-        self._arrays = [type(a)(a) for a in self._arrays] if self.steady else []
+        self._arrays = [type(a)(a) for a in self._arrays] if self.comparable else []
         return self
 
 

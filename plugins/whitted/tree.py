@@ -23,10 +23,10 @@ from ..intersect import off_zero
 from .tables import aligned
 
 # Box tests are wider than exact by some float32 roundings, relative to distances and to coordinates
-_SLACK = 8 * 2.0**-24
+_BOX_MARGIN = 8 * 2.0**-24
 
 # Directions nearer to an axis plane than this count as so much off it
-_LEAST_SLOPE = 1e-18
+_MIN_SLOPE = 1e-18
 
 
 class Tree:
@@ -57,7 +57,7 @@ class Tree:
         hit there if that is less. With ``any_hit``, a ray is done as soon as that has happened.
         """
         # Distance to a plane across an axis: plane * inverse + shift
-        inverse = [1 / off_zero(c, _LEAST_SLOPE) for c in ray.d]
+        inverse = [1 / off_zero(c, _MIN_SLOPE) for c in ray.d]
         shift = [-c * i for c, i in zip(ray.o, inverse, strict=True)]
         rows = [mi.UInt32(2 * axis) + dr.select(ray.d[axis] < 0, mi.UInt32(1), 0) for axis in range(3)]
         reach = state[0]
@@ -108,7 +108,7 @@ class Tree:
                 # One instruction each, where dr.maximum and dr.minimum take more to pass on NaN
                 near[child] = dr.select(enter > near[child], enter, near[child])
                 far[child] = dr.select(leave < far[child], leave, far[child])
-        return near, [f * (1 + _SLACK) for f in far]
+        return near, [f * (1 + _BOX_MARGIN) for f in far]
 
 
 def _to_next(node: mi.UInt32, waiting: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
@@ -142,7 +142,7 @@ def _heap(boxes: np.ndarray, leaf_of: np.ndarray, leaves: int) -> np.ndarray:
     """
     low = np.full((2 * leaves, 3), np.inf)
     high = -low
-    margin = _SLACK * np.abs(boxes).max(axis=(1, 2))[:, None]
+    margin = _BOX_MARGIN * np.abs(boxes).max(axis=(1, 2))[:, None]
     low[leaves + leaf_of] = boxes[:, 0] - margin
     high[leaves + leaf_of] = boxes[:, 1] + margin
     size = leaves

@@ -123,11 +123,11 @@ def test_lists_around_the_eye_follow_the_camera():
     ends = np.random.default_rng(2).uniform(-1, 1, (80, 6))
     nodes = {name: node for name, node in content("schlick").items() if name in ("light", "sky", "floor")}
     nodes["crowd"] = group(np.column_stack([ends, np.full(80, 0.2)]), kind="cone", bsdf=GREEN)
-    size = {"width": 12, "height": 9, "aa": 1, "aamode": "none"}
+    size: dict[str, Any] = {"width": 12, "height": 9, "aa": 1, "aamode": "none", "integrator": "mrt_whitted"}
     views = sensor([0, 1, 4], [0, 0, 0], (12, 9)), sensor([3, 2, 3], [0, 0, 0], (12, 9))
     scene = mi.load_dict({"type": "scene", "first": views[0], "other": views[1], **nodes})
     lists, search = (mi.load_dict({"type": "mrt_whitted", "max_depth": 1}) for _ in range(2))
-    search.kernel_plan = lambda facts: replace(lists.kernel_plan(facts), eye=False)
+    search.kernel_plan = lambda facts: replace(lists.kernel_plan(facts), eye_buffer=False)
     trees = lists.prepare(scene).quadrics
     again = mrt.prepare(scene, **size)
     parameters = mi.traverse(scene)
@@ -141,7 +141,7 @@ def test_lists_around_the_eye_follow_the_camera():
             assert_array_equal(*map(np.array, pictures))
         data = lists.prepare(scene)
         assert data.quadrics is trees
-        assert_allclose(np.ravel(data.eye.place), (x, 1, 4))
+        assert_allclose(np.ravel(data.eye_buffer.place), (x, 1, 4))
         assert_array_equal(again().image, mrt.render(scene, **size).image)
     for way in (lists, search):
         dr.enable_grad(parameters[color])

@@ -85,9 +85,10 @@ def test_a_mirror_whose_bounces_cost_more_bounds_nothing():
     dear = glass(0.9, int_ior=0.5, fresnel="unity")
     planes = mirrors(1.5, specular_reflectance=0.98) | {"light": LIGHT}
     integrator = mi.load_dict({"type": "mrt_whitted"})
-    without = integrator.prepare(loaded(planes)).plan.cut_off
+    without = integrator.prepare(loaded(planes)).plan.contribution_bounds
     ball = {"type": "sphere", "radius": 0.2, "bsdf": dear}
-    assert integrator.prepare(loaded(planes | {"ball": ball})).plan.cut_off == pytest.approx(without)
+    found = integrator.prepare(loaded(planes | {"ball": ball})).plan.contribution_bounds
+    assert found == pytest.approx(without)
     assert without[1] > 8  # a light, seen at all hits
 
 
@@ -95,7 +96,7 @@ def test_the_brightest_lamp_bounds_what_a_path_may_still_bring():
     dim = {**LAMP, "center": [3, 3, 0], "emitter": {"type": "area", "radiance": 1e-3}}
     integrator = mi.load_dict({"type": "mrt_whitted"})
     for lamps in ({"a": LAMP, "b": dim}, {"a": dim, "b": LAMP}):
-        assert integrator.prepare(loaded(balls(**lamps))).plan.cut_off[0] > 500
+        assert integrator.prepare(loaded(balls(**lamps))).plan.contribution_bounds[0] > 500
 
 
 def test_facing_planes_of_any_reflectance_give_numbers():

@@ -83,11 +83,11 @@ choice("spheres", "corrected", same=True, a=SPHERE, light=LIGHT)
 choice("quadrics", (), a=CONE, b=SPHERE, light=LIGHT)
 choice("planes", False, a=PLANE, b=SPHERE, light=LIGHT)
 choice("lights", "loop", same=True, a=SPHERE, light=LIGHT)
-choice("buffers", False, same=True, **CROWD, light=LIGHT)
-choice("eye", False, same=True, a=GROUP, light=LIGHT)
+choice("light_buffers", False, same=True, **CROWD, light=LIGHT)
+choice("eye_buffer", False, same=True, a=GROUP, light=LIGHT)
 choice("sky", "none", a=SPHERE, sky=SKY, light=LIGHT)
 choice("mirrors", False, a=SPHERE, sky=SKY, light=LIGHT)
-choice("cut_off", (math.inf, 9.0), same=True, a=SPHERE, b=CONE, sky=SKY)
+choice("contribution_bounds", (math.inf, 9.0), same=True, a=SPHERE, b=CONE, sky=SKY)
 choice("lobes", ("diffuse",), a=SPHERE, light=LIGHT)
 choice("tangents", False, a=BRUSHED_BALL, light=LIGHT)
 choice("merged", False, same=True, a=SPHERE, b=GLOSSY_CONE, light=LIGHT)
@@ -141,17 +141,17 @@ reason("spheres", "no sphere in the scene", a=MESH)
 reason("spheres", OTHER_SHAPES, a=SPHERE, b=MESH)
 reason("spheres", "a material needs the frame along texture coordinates", a=BRUSHED_BALL)
 reason("lights", "no light", a=SPHERE)
-reason("buffers", "few objects", a=SPHERE, light=LIGHT)
-reason("buffers", OTHER_LIGHT, **CROWD, light={"type": "point"})
-reason("buffers", OTHER_SHAPES, **CROWD, light=LIGHT, b=MESH)
-reason("eye", "few cones and cylinders", a=CONE)
-reason("eye", "the camera is no pinhole", a=GROUP, sensor={"type": "orthographic"})
+reason("light_buffers", "few objects", a=SPHERE, light=LIGHT)
+reason("light_buffers", OTHER_LIGHT, **CROWD, light={"type": "point"})
+reason("light_buffers", OTHER_SHAPES, **CROWD, light=LIGHT, b=MESH)
+reason("eye_buffer", "few cones and cylinders", a=CONE)
+reason("eye_buffer", "the camera is no pinhole", a=GROUP, sensor={"type": "orthographic"})
 reason("mirrors", "no material reflects visibly", a=MATTE_BALL)
 reason("mirrors", "max_depth admits no mirror ray", a=SPHERE, integrator=SHALLOW)
 reason("tangents", "no material depends on the direction of texture coordinates", a=SPHERE)
 reason("lobes", "no material has the specular one", a=MATTE_BALL)
 unbounded = "what may still arrive has no known bound"
-reason("cut_off", unbounded, a=SPHERE, b=CONE, lamp=LAMP, integrator=UNCLAMPED)
+reason("contribution_bounds", unbounded, a=SPHERE, b=CONE, lamp=LAMP, integrator=UNCLAMPED)
 INSTANCE = {"type": "instance", "of": {"type": "ref", "id": "inside"}}
 reason("merged", "instances in the scene", a=SPHERE, inside={"type": "shapegroup", "b": MESH}, c=INSTANCE)
 reason("merged", "a material other than mrt_bsdf", a={"type": "sphere"})
@@ -177,10 +177,10 @@ def test_no_lists_where_they_would_be_too_long():
     integrator = loaded.integrator()
     facts = integrator.prepare(loaded).facts
     facts = replace(facts, lights=2**11)
-    assert integrator.kernel_plan(facts).buffers
+    assert integrator.kernel_plan(facts).light_buffers
     facts = replace(facts, lights=2**11 + 1)
-    assert integrator.kernel_plan(facts).reason("buffers") == "too many lights and objects"
+    assert integrator.kernel_plan(facts).reason("light_buffers") == "too many lights and objects"
     facts = replace(facts, quadrics=(("cone", 2**14),))
-    assert integrator.kernel_plan(facts).eye
+    assert integrator.kernel_plan(facts).eye_buffer
     facts = replace(facts, quadrics=(("cone", 2**14 + 1),))
-    assert integrator.kernel_plan(facts).reason("eye") == "too many cones and cylinders"
+    assert integrator.kernel_plan(facts).reason("eye_buffer") == "too many cones and cylinders"

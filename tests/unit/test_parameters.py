@@ -107,7 +107,7 @@ def test_light_buffers_follow_the_light_and_the_spheres():
     nodes["ball"] = {"type": "sphere", "center": [2, 0, 4], "radius": 0.5, **ours}
     scene = mi.load_dict(nodes | others)
     assert drawn(scene) == 0
-    assert scene.integrator().prepare(scene).plan.buffers
+    assert scene.integrator().prepare(scene).plan.light_buffers
     update(scene, "light.position", [-4, 0, 8])
     assert drawn(scene) > 0.1
     update(scene, "ball.to_world", mi.ScalarTransform4f().translate([-2, 0, 4]).scale(0.5))

@@ -12,6 +12,8 @@ from nodes import group, mesh, sensor
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.rendering.api import render
 
+WHITTED = {"type": "mrt_whitted"}
+
 
 @pytest.mark.parametrize("beneath", [None, "rectangle", "mrt_plane"])
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])
@@ -19,7 +21,7 @@ def test_large_surfaces_near_the_origin_have_no_dark_spots(variant, kind, beneat
     """What a hit is off by goes with the coordinates of the shape, not with its own, which are near zero; nor
     with what a flat shape beneath it would be off by."""
     numbers = {"sphere": [[0, -1000, 0, 1000]], "cylinder": [[-900, -1000, 0, 900, -1000, 0, 1000]]}[kind]
-    scene = {"type": "scene", "large": group(numbers, kind=kind)}
+    scene = {"type": "scene", "integrator": WHITTED, "large": group(numbers, kind=kind)}
     scene["sensor"] = sensor([0.3, 2, 3], [0, 0, 0], (160, 120), fov=20)
     scene["light"] = {"type": "mrt_light", "position": [0.3, 2, 3]}
     if beneath == "rectangle":
@@ -46,7 +48,7 @@ def test_a_grain_on_a_wide_floor_has_its_shadow(variant, kind, place, half):
     goal = np.add(place, [0, 0.005, 0]).tolist()
     grain = {"type": "sphere", "center": [place[0], place[1] + 0.005, place[2]], "radius": 0.005}
     lamp = [place[0] + 0.3, place[1] + 0.5, place[2] - 0.2]
-    nodes = {"type": "scene", "floor": floor(kind, half, turn), "grain": grain}
+    nodes = {"type": "scene", "integrator": WHITTED, "floor": floor(kind, half, turn), "grain": grain}
     nodes["sensor"] = sensor(eye, goal, (160, 120), fov=25, near_clip=1e-3)
     nodes["light"] = {"type": "point", "position": lamp}
     scene = mi.load_dict(nodes)
@@ -64,7 +66,7 @@ def test_a_grain_on_a_wide_floor_has_its_shadow(variant, kind, place, half):
 
 @pytest.mark.parametrize("size", [1e-9, 1e11])
 def test_meshes_that_rays_cannot_meet_are_refused(variant, size):
-    scene = {"type": "scene", "sensor": sensor([0, 0, 6 * size], [0, 0, 0], (4, 3))}
+    scene = {"type": "scene", "integrator": WHITTED, "sensor": sensor([0, 0, 6 * size], [0, 0, 0], (4, 3))}
     scene["floor"] = floor("mesh", 0.5 * size, mi.ScalarTransform4f())
     with pytest.raises(SceneError, match=r'the mesh "floor" is .* across .*: scale the scene'):
         render(scene, aa=1)
