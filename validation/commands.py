@@ -43,7 +43,7 @@ def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: s
 
 def check(scene: int | str, *, out: str | None = None, quick: str = "0", **options: Any) -> int:
     """Check a scene; return 0 where every law holds, 1 where one does not."""
-    from mrt_mitsuba.validation.laws.scene import check_scene
+    from mrt_mitsuba.validation.check import check_scene
 
     settings = {
         **options,

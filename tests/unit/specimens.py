@@ -13,6 +13,7 @@ from mrt_mitsuba.plugins.variants import is_jit, updatable
 from mrt_mitsuba.validation.studies.power import changed_bsdf
 
 DIFFUSE = {"type": "diffuse"}
+VEIL = {"type": "mask", "opacity": 0.7, "nested": DIFFUSE}
 GLASS = {"type": "dielectric"}
 MIRROR = {"type": "conductor"}
 GLOSS = {"type": "roughconductor"}
@@ -73,6 +74,16 @@ def cancelling(value, ctx, wi, wo):
     cosine = dr.normalize(h).z
     lost = dr.exp(100 * (tan2_theta(h) + 1 - 1 / dr.square(cosine)))
     return dr.select(value > 0, value * lost, 0)
+
+
+def by_an_index_that_is_no_number(value, ctx, wi, wo):
+    """A table over the half vector, which there is none of where wo = -wi."""
+    index = mi.Int32(dr.normalize(wi + wo).z) if is_jit() else 0
+    return value * dr.gather(mi.Float, mi.Float(1, 1), index) if is_jit() else value
+
+
+def opaque(value):
+    return 0 * value
 
 
 def detached(value, ctx, wi, wo):
@@ -160,6 +171,10 @@ OF_VALUES = {
     "stairs": Mistake("value", in_stairs, {"roundoff.lost"}, GLOSS),
     "cancelling half vector": Mistake("value", cancelling, {"roundoff.lost"}, GLOSS),
     "NaN at the least roughness": Mistake("value", no_number_in_sharp_lobes, {"finite.values"}, GLOSS),
+    "index that is no number": Mistake("value", by_an_index_that_is_no_number, {"finite.reads"}),
+    "no light straight through": Mistake(
+        "null", opaque, {"null_transmission.each", "null_transmission.mean"}, VEIL
+    ),
     "detached gradient": Mistake("value", detached, {"gradients.values"}, GLOSS),
     "derivatives that are NaN": Mistake("value", steep, {"gradients.values", "gradients.broken"}, GLOSS),
     # whatever types of lobes are asked for
@@ -219,7 +234,7 @@ CHANGES = {name: (mistake.kind, mistake.change) for name, mistake in MISTAKES.it
 def exceeded(check):
     """The figures of laws that are beyond their limits."""
     return {
-        f"{law.name}.{part.figure}" for law in check.laws.values() for part in law.parts if not part.holds
+        f"{law.name}.{part.criterion}" for law in check.laws.values() for part in law.parts if not part.holds
     }
 
 

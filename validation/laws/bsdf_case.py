@@ -1,4 +1,4 @@
-"""A BSDF under examination, and what several of its laws need to know."""
+"""A BSDF under test, and what several of its laws need to know."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.laws import probe
-from mrt_mitsuba.validation.laws.law import Skip
-from mrt_mitsuba.validation.laws.probe import ROUNDED, Array, Lanes, Probe, excess, is_scalar, joined, unit
-from mrt_mitsuba.validation.laws.sphere import DEPTH, POINTS, Cells, encode, integrate
-from mrt_mitsuba.validation.laws.subject import Given, Subject
+from . import probe
+from .case import Case, Given
+from .law import Skip, UsageError
+from .probe import ROUNDED, Array, Function, Lanes, Probe, excess, is_scalar, joined, unit
+from .sphere import DEPTH, POINTS, Cells, encode, integrate
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
 QUICK_ANGLES = (0, 50, 85, 140)
@@ -41,46 +40,16 @@ class View:
     count: int  # of the others
     share: float  # of the others that count
     holes: float  # share of samples at which eval() is not finite
-    case: Case
-
-    def pdf(self, wo: Array) -> Array:
-        """The density of directions [M, 3]. [M]"""
-        return np.maximum(self.case.pdf(self.at.having(wo=wo)), 0)
-
-    @cached_property
-    def cells(self) -> Cells | None:
-        """Cells that resolve the density, with its integrals; None where none do."""
-        # around the mirror direction at all scales, where lobes may be that are not sampled
-        scales = 10 ** self.case.rng.uniform(-4, 0, (600, 1))
-        mirrored = self.at.wi * [-1, -1, 1] + scales * self.case.rng.normal(size=(600, 3))
-        seeds = encode(np.concatenate([self.pilot, unit(mirrored)]))
-        most = max(len(self.density) // 4000, 8)
-        cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
-        crowd = cells.counts(encode(self.pilot))
-        crowded = (crowd * ((cells.level == DEPTH) & (crowd > 4 * most))).sum()
-        # at the normal, all azimuths of the finest cells are one place
-        radius = np.hypot(*self.pilot.T[:2])
-        centre = (radius < np.sqrt(2) * 0.5**DEPTH).sum()
-        if max(crowded, centre) > 0.01 * len(self.pilot):  # samples are closer together than the finest cells
-            return None
-        integrals = integrate(self.pdf, cells, self.case.rng, self.codes, self.count)
-        # samples in cells where fewer than two of the cell's points are expected within the lobe
-        density_there = self.density[-self.count :]
-        weights = 1 / (self.count * density_there[density_there > 0])
-        covered = integrals.counts(self.codes, weights)
-        coarse = covered * POINTS < 2 * integrals.solid_angle
-        overlooked = integrals.counts(self.codes)[coarse].sum() / self.count
-        known = integrals.mean.sum() > self.share or overlooked < OVERLOOKED
-        return integrals if known else None
 
 
-class Case(Subject, Probe):
-    """A BSDF under examination, and what several laws need to know of it."""
+class BsdfCase(Case, Probe):
+    """A BSDF under test, and what several laws need to know of it."""
 
     word = "bsdf"
 
     def __init__(self, given: Given, quick: bool, seed: int) -> None:
-        super().__init__(given, quick, seed)
+        Case.__init__(self, given, quick, seed)
+        Probe.__init__(self, self.plugin)
         if not isinstance(self.plugin, mi.BSDF):
             kind = type(self.plugin).__name__
             raise UsageError(f"{kind} is not a BSDF of {mi.variant()}: give a dict or a loaded BSDF")
@@ -102,8 +71,45 @@ class Case(Subject, Probe):
             codes = encode(samples.wo[first:][density[first:] > 0])
             count = len(u) - first
             share = len(codes) / count
-            views.append(View(at, samples, density, pilot, codes, count, share, holes.mean(), self))
+            views.append(View(at, samples, density, pilot, codes, count, share, holes.mean()))
         return views
+
+    @cached_property
+    def cells(self) -> list[Cells | None]:
+        """For each view, cells that resolve the density, with its integrals; None where none do."""
+        return [self._cells(view) for view in self.views]
+
+    def density_at(self, view: View) -> Function:
+        """The density of directions [M, 3] in a view, as a function."""
+
+        def density(wo: Array) -> Array:
+            return np.maximum(self.pdf(view.at.having(wo=wo)), 0)
+
+        return density
+
+    def _cells(self, view: View) -> Cells | None:
+        # around the mirror direction at all scales, where lobes may be that are not sampled
+        scales = 10 ** self.rng.uniform(-4, 0, (600, 1))
+        mirrored = view.at.wi * [-1, -1, 1] + scales * self.rng.normal(size=(600, 3))
+        seeds = encode(np.concatenate([view.pilot, unit(mirrored)]))
+        most = max(len(view.density) // 4000, 8)
+        cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
+        crowd = cells.counts(encode(view.pilot))
+        crowded = (crowd * ((cells.level == DEPTH) & (crowd > 4 * most))).sum()
+        # at the normal, all azimuths of the finest cells are one place
+        radius = np.hypot(*view.pilot.T[:2])
+        centre = (radius < np.sqrt(2) * 0.5**DEPTH).sum()
+        if max(crowded, centre) > 0.01 * len(view.pilot):  # samples are closer together than the finest cells
+            return None
+        integrals = integrate(self.density_at(view), cells, self.rng, view.codes, view.count)
+        # samples in cells where fewer than two of the cell's points are expected within the lobe
+        density_there = view.density[-view.count :]
+        weights = 1 / (view.count * density_there[density_there > 0])
+        covered = integrals.counts(view.codes, weights)
+        coarse = covered * POINTS < 2 * integrals.solid_angle
+        overlooked = integrals.counts(view.codes)[coarse].sum() / view.count
+        known = integrals.mean.sum() > view.share or overlooked < OVERLOOKED
+        return integrals if known else None
 
     @cached_property
     def drawn(self) -> Lanes:
@@ -116,9 +122,9 @@ class Case(Subject, Probe):
         """The directions of incidence ``wi`` and texture coordinates ``uv`` of all views."""
         return joined([view.at[np.newaxis] for view in self.views])
 
-    def copy(self) -> Case:
+    def copy(self) -> BsdfCase:
         """A case whose parameters can be changed, with a BSDF of its own if it can be loaded."""
-        made = Case(self.plugin if self.description is None else self.load(), self.quick, self.seed)
+        made = BsdfCase(self.plugin if self.description is None else self.load(), self.quick, self.seed)
         made.description = self.description
         made.pairs = self.pairs
         return made
@@ -204,7 +210,7 @@ def narrow(s: Lanes) -> Array:
     return too_narrow
 
 
-def parameters(case: Case) -> Iterator[tuple[str, mi.Float]]:
+def parameters(case: BsdfCase) -> Iterator[tuple[str, mi.Float]]:
     """Yield the parameters that hold floating-point numbers which are amounts."""
     params = mi.traverse(case.plugin)
     for key in list(params.keys()):
@@ -218,7 +224,7 @@ def parameters(case: Case) -> Iterator[tuple[str, mi.Float]]:
 
 
 @contextmanager
-def changed(case: Case, key: str, *, factor: float = 1, summand: mi.Float = 0) -> Iterator[None]:
+def changed(case: BsdfCase, key: str, *, factor: float = 1, summand: mi.Float = 0) -> Iterator[None]:
     """Change a parameter for a while: multiply it by one number, and add another."""
     params = mi.traverse(case.plugin)
     before = type(params[key])(params[key])  # else it changes with the BSDF

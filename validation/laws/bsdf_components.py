@@ -6,12 +6,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba import runtime
-from mrt_mitsuba.validation.laws.bsdf_case import POINTWISE, Case, pair_errors, parameters
-from mrt_mitsuba.validation.laws.bsdf_snippets import SAMPLE, VALUE
-from mrt_mitsuba.validation.laws.faults import larger_by
-from mrt_mitsuba.validation.laws.law import Law, Skip, figures, finds, most, number_of
-from mrt_mitsuba.validation.laws.probe import Array, Lanes, Probe, context, excess
+from .bsdf_case import POINTWISE, BsdfCase, pair_errors, parameters
+from .bsdf_snippets import SAMPLE, VALUE
+from .faults import VEIL, larger, larger_by, member, of_sample
+from .law import SIGMAS, Outcome, Skip, finds, measures, most, number_of
+from .probe import Array, Lanes, Probe, context, excess, method
 
 FLAGS = "print([hex(int(bsdf.flags(i))) for i in range(bsdf.component_count())], hex(int(bsdf.flags())))\n"
 UPDATED = """params = mi.traverse(bsdf)
@@ -50,7 +49,10 @@ def without_mask(size, ctx):
     return other
 
 
-@figures(
+@finds("sum", "a component brighter than its share", 1e-4, eval=in_first_component)
+@finds("masked", "lobes brighter where they are asked for by type", 1e-4, eval=with_mask)
+@finds("masked_samples", "types of lobes ignored", 1, context=without_mask)
+@measures(
     flags=most(
         "flags of the whole that no component has, or the other way around",
         0,
@@ -75,42 +77,39 @@ def without_mask(size, ctx):
         "samples and densities of lobes that the mask of types {mask:#x} leaves out", 0, SELECTS, MASKED
     ),
 )
-@finds("sum", "a component brighter than its share", 1e-4, eval=in_first_component)
-@finds("masked", "lobes brighter where they are asked for by type", 1e-4, eval=with_mask)
-@finds("masked_samples", "types of lobes ignored", 1, context=without_mask)
-def components(law: Law, case: Case) -> None:
+def components(law: Outcome, case: BsdfCase) -> None:
     """A component does what its flags say; f = Σ fᵢ; ``component`` and ``type_mask`` of ``ctx`` select."""
     bsdf = case.plugin
     p = case.pairs
     flags = [bsdf.flags(i) for i in range(bsdf.component_count())]
     union = int(np.bitwise_or.reduce(flags or [0]))
-    law.hold("flags", (union ^ bsdf.flags()).bit_count())
+    law.check("flags", (union ^ bsdf.flags()).bit_count())
     if case.description is not None:
         copy = case.load()
         old = dict(parameters(case))
         mi.traverse(copy).update({key: type(value)(value) for key, value in old.items()})
-        law.hold("updated", abs(copy.component_count() - len(flags)), keys=list(old))
+        law.check("updated", abs(copy.component_count() - len(flags)), keys=list(old))
     parts = [case.eval(p, context(i)) for i in range(len(flags))]
-    law.hold("sum", excess(np.sum(parts, axis=0), p.value, p.value_off), p)
+    law.check("sum", excess(np.sum(parts, axis=0), p.value, p.value_off), p)
     dark = 0
     for i, (flag, value) in enumerate(zip(flags, parts, strict=True)):
         dark += _component(law, case, i, flag, value)
-    law.hold("dark", dark)
+    law.check("dark", dark)
     _masks(law, case, flags, parts)
 
 
-def _component(law: Law, case: Case, i: int, flag: int, value: Array) -> int:
+def _component(law: Outcome, case: BsdfCase, i: int, flag: int, value: Array) -> int:
     """Hold values and samples of a component to its flags; the number of sides of these that are black."""
     p = case.pairs
     lit = (value != 0).any(axis=1)
     bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(flag & ~mi.BSDFFlags.Delta, p)
-    law.hold("values", bad, p, component=i)
+    law.check("values", bad, p, component=i)
     # samples of one component that go by another name, kind or side
     s = case.sample(case.at_random(2**12, 2**14), context(i))
     drawn = s.lit & np.isfinite(s.weight).all(axis=1)
     bad = (s.lobe != i) | ((s.flags & ~flag) != 0) | (s.flags == 0)
     bad |= (abs(s.wo[:, 2]) > 1e-6) & ~_allowed(flag, s)
-    law.hold("samples", drawn & bad, s, component=i)
+    law.check("samples", drawn & bad, s, component=i)
     # sides that flags name and where there is no light, of a component that has some
     z = np.concatenate([p.wi[lit, 2], s.wi[drawn, 2]])
     if not len(z):
@@ -128,7 +127,7 @@ def _allowed(flags: int, at: Lanes) -> Array:
     return ((flags & way) != 0) & ((flags & side) != 0)
 
 
-def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
+def _masks(law: Outcome, case: BsdfCase, flags: list[int], parts: list[Array]) -> None:
     """With a mask of types, a BSDF is the sum of the components of these types."""
     every = mi.BSDFFlags.All
     kinds = [flag & every for flag in flags]
@@ -139,12 +138,63 @@ def _masks(law: Law, case: Case, flags: list[int], parts: list[Array]) -> None:
         chosen = [part for kind, part in zip(kinds, parts, strict=True) if kind & ~mask == 0]
         expected = np.sum([np.zeros_like(p.value), *chosen], axis=0)
         value, pdf = case.both(p, ctx)
-        law.hold("masked", excess(value, expected, p.value_off), p, mask=mask)
+        law.check("masked", excess(value, expected, p.value_off), p, mask=mask)
         s = case.sample(few.having(u=case.uniform(len(few.wi), 3)), ctx)
         bad = s.lit & np.isfinite(s.weight).all(axis=1) & ((s.flags & ~mask) != 0)
         if not chosen:
             bad |= pdf[: len(bad)] > 0
-        law.hold("masked_samples", bad, few, mask=mask)
+        law.check("masked_samples", bad, few, mask=mask)
+
+
+NULL = """print("eval_null_transmission():", bsdf.eval_null_transmission(si))
+for i in range(8):
+    bs, weight = bsdf.sample(ctx, si, (i + 0.5) / 8, mi.Point2f(0.3, 0.6))
+    through = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+    print("a sample straight through:", through, "to", bs.wo, "probability x weight:", bs.pdf * weight)
+"""
+STRAIGHT = "integrators follow shadow rays through surfaces by it; where it is 0, what lies behind is black"
+
+
+@finds("mean", "eval_null_transmission() too large", 0.05, nested=VEIL, null=larger)
+@finds("each", "eval_null_transmission() too large", 3e-3, nested=VEIL, null=larger)
+@finds(
+    "straight", "directions off the straight one", 3e-3, nested=VEIL, sample=of_sample(member("wo", larger))
+)
+@measures(
+    each=most(
+        "eval_null_transmission() against probability x weight of a sample straight through, relative",
+        POINTWISE,
+        STRAIGHT,
+        NULL,
+    ),
+    mean=most(
+        f"eval_null_transmission() against the mean weight of samples straight through, beyond {SIGMAS} "
+        "standard errors",
+        POINTWISE,
+        STRAIGHT,
+        NULL,
+    ),
+    straight=most("direction of a sample straight through off -wi", 1e-3, "the flag Null says so", NULL),
+)
+def null_transmission(law: Outcome, case: BsdfCase) -> None:
+    """``eval_null_transmission`` is the light that lobes of type ``Null`` let through, on average."""
+    null = [bool(case.plugin.flags(i) & mi.BSDFFlags.Null) for i in range(case.plugin.component_count())]
+    value = method(case.plugin, "eval_null_transmission")
+
+    def through(_: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Vector3f) -> mi.Spectrum:
+        return value(si)
+
+    s = case.sample(case.at_random(2**14, 2**17))
+    s.through = case.ask(through, s, given="u")[0]
+    passes = s.lit & ((s.flags & mi.BSDFFlags.Null) != 0)
+    if not (any(null) or passes.any() or s.through.any()):
+        raise Skip("no lobe of type Null")
+    difference = np.where(passes[:, None], s.weight, 0) - s.through
+    error = difference.std(axis=0) / np.sqrt(len(difference))
+    law.check("mean", np.max(abs(difference.mean(axis=0)) - SIGMAS * error), s[0])
+    law.check("straight", abs(s.wo + s.wi).max(axis=1), s, where=passes)
+    if sum(null) == 1:
+        law.check("each", excess(s.weight * s.pdf[:, None], s.through), s, where=passes)
 
 
 def by_variant(size, value, *_):
@@ -152,7 +202,8 @@ def by_variant(size, value, *_):
     return value if dr.is_jit_v(value) else (1 + size) * value
 
 
-@figures(
+@finds("same", "values larger in scalar variants", 3e-3, value=by_variant)
+@measures(
     same=most(
         "value and density in {other} against {here}, relative, beyond rounding",
         POINTWISE,
@@ -160,8 +211,7 @@ def by_variant(size, value, *_):
         VALUE,
     )
 )
-@finds("same", "values larger in scalar variants", 3e-3, value=by_variant)
-def variants(law: Law, case: Case) -> None:
+def variants(law: Outcome, case: BsdfCase) -> None:
     """Values are the same in the scalar variant, and in the spectral one where colours are grey."""
     here = mi.variant()
     case.with_()
@@ -180,12 +230,12 @@ def variants(law: Law, case: Case) -> None:
         if not other.endswith("_rgb"):  # the mean of equal channels, however many there are
             value = value.mean(axis=1)
             expected = few.having(value=few.value.mean(axis=1), value_off=few.value_off.max(axis=1))
-        law.hold(
+        law.check(
             "same", pair_errors(expected, value, pdf), few, variants=(here, other), other=other, here=here
         )
 
 
-@figures(
+@measures(
     same=most(
         "values of the BSDF {which} after a switch to {other} and back, relative, beyond rounding",
         1e-4,
@@ -193,16 +243,16 @@ def variants(law: Law, case: Case) -> None:
         VALUE,
     )
 )
-def switch(law: Law, case: Case) -> None:
+def switch(law: Outcome, case: BsdfCase) -> None:
     """Values are the same after a switch to another variant and back, loaded before it or anew."""
     here = mi.variant()
     few = case.few(case.pairs, 1000, 1000)
-    other = next(v for v in ("scalar_rgb", *runtime.usable_variants()) if v != here)
-    runtime.use(other)
-    runtime.use(here)
+    other = next(v for v in mi.variants() if v.startswith("scalar_") and v != here)
+    mi.set_variant(other)
+    mi.set_variant(here)
     candidates = {"that was loaded before": case.plugin}
     if case.description is not None:
         candidates["loaded anew"] = case.load()
     for which, bsdf in candidates.items():
         error = pair_errors(few, *Probe(bsdf).both(few))
-        law.hold("same", error, few, which=which, other=other, variants=(here, other, here))
+        law.check("same", error, few, which=which, other=other, variants=(here, other, here))

@@ -8,11 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.laws import probe
-from mrt_mitsuba.validation.laws.bsdf_case import Case, changed, live, narrow, parameters
-from mrt_mitsuba.validation.laws.faults import GLOSS, of_weight
-from mrt_mitsuba.validation.laws.law import FEWEST, SIGMAS, Law, Skip, figures, finds, most, number_of
-from mrt_mitsuba.validation.laws.probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
+from . import probe
+from .bsdf_case import BsdfCase, changed, live, narrow, parameters
+from .faults import GLOSS, of_weight
+from .law import MIN_QUANTILE_ERRORS, SIGMAS, Outcome, Skip, finds, measures, most, number_of
+from .probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
 
 GRADIENT = 2e-2  # relative; differences of two widths agree better
 IN_THE_MEAN = 5e-2  # where outlines of lobes move, derivatives of samples miss them
@@ -60,7 +60,9 @@ def steeper(size, value, *_):
     return value + size * (value - dr.detach(value))
 
 
-@figures(
+@finds("values", "derivative of values too large", 0.03, nested=GLOSS, value=steeper)
+@finds("weights", "derivative of weights too large", 0.03, nested=GLOSS, sample=of_weight(steeper))
+@measures(
     values=most(
         "derivative of values by {key}{how}, relative, beyond the error of differences",
         GRADIENT,
@@ -93,9 +95,7 @@ def steeper(size, value, *_):
         UPDATE,
     ),
 )
-@finds("values", "derivative of values too large", 0.03, nested=GLOSS, value=steeper)
-@finds("weights", "derivative of weights too large", 0.03, nested=GLOSS, sample=of_weight(steeper))
-def gradients(law: Law, case: Case) -> None:
+def gradients(law: Outcome, case: BsdfCase) -> None:
     """Derivatives by every parameter agree with differences, and those of samples with those of values."""
     if "_ad_" not in mi.variant():
         raise Skip(f"{mi.variant()} has no derivatives")
@@ -116,7 +116,7 @@ def gradients(law: Law, case: Case) -> None:
                 _sampled(law, case, key)
 
 
-def _attached(law: Law, case: Case, key: str) -> bool:
+def _attached(law: Outcome, case: BsdfCase, key: str) -> bool:
     """Hold the derivative by one parameter to differences; return False where it is detached, and wrong."""
     few = case.lit
     (derivative,), attached = _derivatives(case, key, len(few.wi), lambda: [_values(case)])
@@ -128,7 +128,7 @@ def _attached(law: Law, case: Case, key: str) -> bool:
         _reached(law, case, key)
     off = abs(derivative - slope)
     known = np.isfinite(error)
-    if known.sum() < FEWEST:
+    if known.sum() < MIN_QUANTILE_ERRORS:
         law.notes.append(f"{key}: its least differences move lobes away, and cannot judge derivatives")
         return True
     usual = known & (off <= np.quantile(off[known], 0.98))  # where values have a kink, no slope is
@@ -136,13 +136,13 @@ def _attached(law: Law, case: Case, key: str) -> bool:
     measured = beyond / max(abs(slope)[usual].sum(), abs(derivative)[usual].sum(), 1e-30)
     i = int(np.where(usual, off, 0).argmax())
     how = "" if attached else " (detached)"
-    law.hold("values", measured, few[i], key=key, how=how)
-    law.hold("broken", broken, few, key=key)
+    law.check("values", measured, few[i], key=key, how=how)
+    law.check("broken", broken, few, key=key)
     return attached or measured <= GRADIENT
 
 
 def _derivatives(
-    case: Case, key: str, count: int, values: Callable[[], list[mi.Float]]
+    case: BsdfCase, key: str, count: int, values: Callable[[], list[mi.Float]]
 ) -> tuple[Array, bool]:
     """Derivatives [K, N] by a parameter of K arrays that ``values`` makes, and whether there are any."""
     shift = mi.Float(0)
@@ -156,7 +156,7 @@ def _derivatives(
         return np.array([np.broadcast_to(x, count) for x in derivatives]), attached
 
 
-def _sampled(law: Law, case: Case, key: str) -> None:
+def _sampled(law: Outcome, case: BsdfCase, key: str) -> None:
     """Hold the derivative of samples' weights to that of values over a density that does not change.
 
     Integrators follow a sample as a constant direction. Where one moves with the parameter, its weight may
@@ -194,7 +194,7 @@ def _sampled(law: Law, case: Case, key: str) -> None:
         figure = "weights"
         known = abs(known)
         off = known[known <= np.quantile(known, 0.98)].mean()
-    law.hold(figure, off / size, at[i], key=key)
+    law.check(figure, off / size, at[i], key=key)
 
 
 def _total(spectrum: mi.Spectrum) -> mi.Float:
@@ -202,7 +202,7 @@ def _total(spectrum: mi.Spectrum) -> mi.Float:
     return dr.select(dr.isfinite(total), total, 0)
 
 
-def _reached(law: Law, case: Case, key: str) -> None:
+def _reached(law: Outcome, case: BsdfCase, key: str) -> None:
     """A parameter whose updates change no value should change none where it is loaded, either."""
     name = key.removesuffix(".value")
     few = case.lit
@@ -216,17 +216,17 @@ def _reached(law: Law, case: Case, key: str) -> None:
         return
     value = other.eval(few)
     off = excess(value, few.value, few.value_off)
-    law.hold("reached", off, few.having(value=value), key=key, number=number)
+    law.check("reached", off, few.having(value=value), key=key, number=number)
 
 
-def _sizes(case: Case, key: str) -> mi.Float:
+def _sizes(case: BsdfCase, key: str) -> mi.Float:
     """The sizes of the numbers of a parameter: a spectrum's may be of many."""
     numbers = mi.traverse(case.plugin)[key]
     usual = float(np.mean(abs(np.array(numbers)))) or 0.05
     return dr.select(numbers == 0, usual, dr.abs(dr.detach(numbers)))
 
 
-def _values(case: Case) -> mi.Float:
+def _values(case: BsdfCase) -> mi.Float:
     """Values at pairs, with derivatives, each over what it is without a change. [N]"""
     few = case.lit
     wo = as_mitsuba("Vector3f", few.wo)
@@ -235,7 +235,7 @@ def _values(case: Case) -> mi.Float:
     return _total(case.plugin.eval(context(), si, wo)) / as_mitsuba("Float", scale)
 
 
-def _differences(case: Case, key: str) -> tuple[Array, Array]:
+def _differences(case: BsdfCase, key: str) -> tuple[Array, Array]:
     """Central differences [N] of the width that is off by least, and by how much they may be off [N].
 
     That is what the next larger width says otherwise, the rounding of values, and half of what the slopes to

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-from mrt_mitsuba.validation.compare import sidak
-from mrt_mitsuba.validation.laws import probe
-from mrt_mitsuba.validation.laws.bsdf_case import FIT, POINTWISE, Case, View, live, narrow
-from mrt_mitsuba.validation.laws.bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
-from mrt_mitsuba.validation.laws.faults import (
+from . import plots, probe
+from .bsdf_case import FIT, POINTWISE, BsdfCase, View, live, narrow
+from .bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
+from .faults import (
     DEGREE,
     PLACE,
     larger,
@@ -22,19 +25,20 @@ from mrt_mitsuba.validation.laws.faults import (
     put,
     smaller,
 )
-from mrt_mitsuba.validation.laws.law import (
-    FEWEST,
+from .law import (
+    MIN_QUANTILE_ERRORS,
     SIGMAS,
-    Law,
-    figures,
+    Outcome,
     finds,
+    measures,
     most,
     number_of,
-    rare,
+    p_value,
     share_of,
+    sidak,
 )
-from mrt_mitsuba.validation.laws.probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
-from mrt_mitsuba.validation.laws.sphere import (
+from .probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
+from .sphere import (
     SMALL,
     Cells,
     chi_square,
@@ -50,6 +54,7 @@ NUDGED = """for moved in np.eye(3) * 2.0**-18 * np.where(np.array(u) < 0.5, 1, -
 UNRESOLVED = "neither float32 directions nor the samples resolve the lobe"
 BROAD = 20.0  # a density per steradian: lobes are then wide against a degree
 NUDGE = 2.0**-18  # of a random number: a hundred roundings of the direction
+PLOTTED = 5  # level of the cells of a plot
 GRAZING = (83, 86, 88, 89.5, 94, 92, 90.5)  # degrees
 AGAIN = "the same formula, evaluated once more at a rounded direction"
 FITS = "rational fits of Smith's G1 in use are off by 0.35 %"
@@ -87,16 +92,26 @@ def stairs_of(size, u):
     return mi.Point2f(dr.floor(u.x / size) * size, u.y)
 
 
-@figures(
-    cells=rare("least chance of counts at {angles} angles if samples follow pdf(), for their number", CELL),
+@finds("cells", "density too large where a tenth of the samples go", 0.03, quick=0.1, pdf=in_tenth)
+@finds("small", "density too small in a cone of 1 degree", 0.5, quick=np.inf, pdf=in_cone)
+@finds("slices", "no samples in a slice of azimuth, in degrees", 0.3, quick=np.inf, sample=around_slice)
+@finds("dark", "no density in a slice of azimuth, in degrees", 0.3, pdf=no_density)
+@finds("still", "directions in stairs, in random numbers", 1e-5, u=stairs_of)
+@finds("integral", "density too large everywhere", 0.01, pdf=larger)
+@measures(
+    cells=p_value(
+        "least chance of counts at {angles} angles if samples follow pdf(), for their number", CELL
+    ),
     integral=most(
         f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} standard errors",
         FIT,
         FITS,
         WHOLE,
     ),
-    small=rare("chance of such counts of all angles in cells of a degree, for their number", CELL),
-    slices=rare("chance of such counts of all angles in slices of a degree or two, for their number", WHOLE),
+    small=p_value("chance of such counts of all angles in cells of a degree, for their number", CELL),
+    slices=p_value(
+        "chance of such counts of all angles in slices of a degree or two, for their number", WHOLE
+    ),
     still=share_of(
         "share of samples that stay where two of their random numbers move by 2^-18",
         0.05,
@@ -110,13 +125,7 @@ def stairs_of(size, u):
         VALUE,
     ),
 )
-@finds("cells", "density too large where a tenth of the samples go", 0.03, quick=0.1, pdf=in_tenth)
-@finds("small", "density too small in a cone of 1 degree", 0.5, quick=np.inf, pdf=in_cone)
-@finds("slices", "no samples in a slice of azimuth, in degrees", 0.3, quick=np.inf, sample=around_slice)
-@finds("dark", "no density in a slice of azimuth, in degrees", 0.3, pdf=no_density)
-@finds("still", "directions in stairs, in random numbers", 1e-5, u=stairs_of)
-@finds("integral", "density too large everywhere", 0.01, pdf=larger)
-def sampling(law: Law, case: Case) -> None:
+def sampling(law: Outcome, case: BsdfCase) -> None:
     """Samples follow the density: the share of samples in a cell is ∫ pdf dω over it (Pearson's χ²).
 
     In whole cells of equal counts over both hemispheres; in a full check also in small ones and in narrow
@@ -129,12 +138,12 @@ def sampling(law: Law, case: Case) -> None:
     rng = np.random.default_rng((case.seed, count))
     wi, wo = probe.unit(rng.normal(size=(2, count, 3)))
     anywhere = Lanes(wi=wi, wo=wo, uv=rng.random((count, 2), np.float32))
-    law.hold("dark", probe.without_density(*case.both(anywhere)), anywhere)
-    judged = [(view, view.cells) for view in case.views if view.cells]
+    law.check("dark", probe.without_density(*case.both(anywhere)), anywhere)
+    judged = [(view, cells) for view, cells in zip(case.views, case.cells, strict=True) if cells]
     if not judged:
         law.notes.append(f"{UNRESOLVED} at every angle")
         return
-    at = case.incidence[[bool(view.cells) for view in case.views]]
+    at = case.incidence[[bool(cells) for cells in case.cells]]
     tests = []  # [angles, 6, 2]
     worst = []
     beyond = []
@@ -148,16 +157,31 @@ def sampling(law: Law, case: Case) -> None:
     chances = stats.chi2.sf(by_angle[..., 0], by_angle[..., 1])
     chance = sidak(chances.min(), chances.size)
     i = chances[:-1].min(axis=1).argmin()
-    law.hold("cells", chance, at[i], cell=worst[i], angles=len(judged))
-    law.hold("integral", np.maximum(beyond, 0), at)
+    law.check("cells", chance, at[i], cell=worst[i], angles=len(judged))
+    law.check("integral", np.maximum(beyond, 0), at)
     broad = [view for view in case.views if 0 < view.density.max() < BROAD]
     if broad and not case.quick and not is_scalar():
         _in_small_cells(law, case, broad)
+    if not law.holds:
+        law.plot = _densities(case, judged[i][0])
     if len(judged) < len(case.views):
         law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(judged)} angles, which are left out")
 
 
-def _nudged(law: Law, case: Case) -> None:
+def _densities(case: BsdfCase, view: View) -> Callable[[], Any]:
+    """A plot of the densities of samples and of pdf() for one direction of incidence."""
+    cells = Cells.uniform(PLOTTED)
+    r, turn = cells.corner
+    place = cells.below.astype(int), (r / cells.width).astype(int), (turn / cells.width).astype(int)
+    seen = cells.counts(encode(view.samples.wo[view.density > 0])) / len(view.density)
+    expected, _ = cells.integrals(case.density_at(view), case.rng)
+    grids = np.zeros((2, 2, 2**PLOTTED, 2**PLOTTED))
+    grids[0][place] = seen / cells.solid_angle
+    grids[1][place] = expected[:, 0] / cells.solid_angle
+    return partial(plots.density, *grids, np.degrees(np.arccos(view.at.wi[2])))
+
+
+def _nudged(law: Outcome, case: BsdfCase) -> None:
     """Of three random numbers, two at least lead to another direction when they move a little."""
     drawn = case.drawn
     changes = np.zeros(len(drawn.u), int)
@@ -166,16 +190,16 @@ def _nudged(law: Law, case: Case) -> None:
         wo = case.sample(drawn.having(u=moved)).wo
         changes += (wo != drawn.wo).any(axis=1)
     smooth = drawn.lit & ~drawn.delta & (drawn.pdf < BROAD) & drawn.wo.any(axis=1)
-    if smooth.sum() >= FEWEST:
-        law.hold("still", (changes < 2)[smooth], drawn[smooth])
+    if smooth.sum() >= MIN_QUANTILE_ERRORS:
+        law.check("still", (changes < 2)[smooth], drawn[smooth])
 
 
-def _in_small_cells(law: Law, case: Case, views: list[View]) -> None:
+def _in_small_cells(law: Outcome, case: BsdfCase, views: list[View]) -> None:
     cells = Cells.uniform(SMALL)
     counts = []
     for view in views:
         seen = cells.counts(encode(view.samples.wo[view.density > 0]))
-        expected = cells.expected(view.pdf, len(view.density), case.rng)
+        expected = cells.expected(case.density_at(view), len(view.density), case.rng)
         counts.append([seen, *expected])
     view = max(views, key=lambda v: v.at.wi[2])
     hold_small(law, cells, np.sum(counts, axis=0), FIT, view.at)
@@ -187,16 +211,6 @@ def in_stairs(u):
     return dr.floor(16 * u.x) - 2 * dr.floor(8 * u.x)
 
 
-@figures(
-    density=most(f"density of a sample against pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
-    weight=most(f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
-    discrete=most(
-        f"probability of a single direction (delta) less its share, beyond {SIGMAS} standard errors",
-        POINTWISE,
-        "a count",
-        WHOLE,
-    ),
-)
 @finds("density", "density that a sample states too large", 3e-3, sample=of_sample(member("pdf", larger)))
 @finds("weight", "weight of a sample too large", 3e-3, sample=of_weight(larger))
 @finds("weight", "weight of a sample in stairs", 3e-3, sample=of_weight(in_stairs))
@@ -207,7 +221,17 @@ def in_stairs(u):
     nested={"type": "conductor"},
     sample=of_sample(member("pdf", smaller)),
 )
-def weights(law: Law, case: Case) -> None:
+@measures(
+    density=most(f"density of a sample against pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
+    weight=most(f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
+    discrete=most(
+        f"probability of a single direction (delta) less its share, beyond {SIGMAS} standard errors",
+        POINTWISE,
+        "a count",
+        WHOLE,
+    ),
+)
+def weights(law: Outcome, case: BsdfCase) -> None:
     """The density and weight of a sample are ``pdf`` and ``eval`` / ``pdf`` of its direction.
 
     Of lobes of one direction, the density is the probability with which they are drawn.
@@ -223,7 +247,7 @@ def weights(law: Law, case: Case) -> None:
 
     for name, stated, function in (("density", drawn.pdf, case.pdf), ("weight", drawn.weight, ratio)):
         error = excess(stated, function(drawn), case.spread(function, drawn))
-        law.hold(name, error, drawn, where=counts)
+        law.check(name, error, drawn, where=counts)
     errors = []
     angles = []
     for i, view in enumerate(case.views):
@@ -236,7 +260,7 @@ def weights(law: Law, case: Case) -> None:
             errors.append(max(abs(here.mean() - stated) - SIGMAS * sigma, 0))
             angles.append(i)
     if errors:
-        law.hold("discrete", errors, case.incidence[angles])
+        law.check("discrete", errors, case.incidence[angles])
 
 
 def too_bright(size, value, *_):
@@ -244,7 +268,9 @@ def too_bright(size, value, *_):
     return 2 * (1 + size) * value
 
 
-@figures(
+@finds("largest", "albedo above 1", 0.01, value=too_bright)
+@finds("apart", "value of eval() too large", 0.02, eval=larger)
+@measures(
     largest=most(
         f"largest albedo, less {SIGMAS} standard errors",
         1 + FIT,
@@ -258,9 +284,7 @@ def too_bright(size, value, *_):
         WHOLE,
     ),
 )
-@finds("largest", "albedo above 1", 0.01, value=too_bright)
-@finds("apart", "value of eval() too large", 0.02, eval=larger)
-def energy(law: Law, case: Case) -> None:
+def energy(law: Outcome, case: BsdfCase) -> None:
     """The albedo ∫ f |cos θo| dωo is at most 1, and the same by samples and by quadrature.
 
     In the mode of importance, in which transmitted energy is not rescaled.
@@ -277,15 +301,23 @@ def energy(law: Law, case: Case) -> None:
         s = case.sample(grazing[i].having(u=case.uniform(count, 3)), mode)
         means.append(_mean(s.weight))
     apart = []
-    for view in case.views:
+    quadrature = [np.nan] * len(GRAZING)
+    for view, cells in zip(case.views, case.cells, strict=True):
         s = case.sample(view.samples, mode)
         means.append(_mean(s.weight))
         # where values are NaN, the law ``finite`` says so
-        apart.append(_apart(case, view, view.cells, s) if view.cells and view.holes < 0.01 else 0)
+        known = cells is not None and view.holes < 0.01
+        difference, albedo = _apart(case, view, cells, s) if known else (0.0, np.nan)
+        apart.append(difference)
+        quadrature.append(albedo)
     surely = [(mean - SIGMAS * error).max() for mean, error in means]
-    law.hold("largest", surely, joined([grazing, case.incidence]))
-    if any(view.cells for view in case.views):
-        law.hold("apart", apart, case.incidence)
+    at = joined([grazing, case.incidence])
+    law.check("largest", surely, at)
+    if any(case.cells):
+        law.check("apart", apart, case.incidence)
+    if not law.holds:
+        rows = [np.max(means, axis=2)[:, i] for i in (0, 1)]
+        law.plot = partial(plots.albedo, np.degrees(np.arccos(at.wi[:, 2])), *rows, np.array(quadrature))
 
 
 def _mean(weight: Array) -> tuple[Array, Array]:
@@ -294,8 +326,11 @@ def _mean(weight: Array) -> tuple[Array, Array]:
     return weight.mean(axis=0), weight.std(axis=0) / np.sqrt(len(weight))
 
 
-def _apart(case: Case, view: View, cells: Cells, s: Lanes) -> float:
-    """How far the albedo of samples and the integral of eval() differ, beyond chance, relative."""
+def _apart(case: BsdfCase, view: View, cells: Cells, s: Lanes) -> tuple[float, float]:
+    """The relative difference, beyond chance, of albedos by samples and by quadrature; and the latter.
+
+    That is of the brightest channel, with lobes of one direction by samples.
+    """
     smooth = np.where(s.delta[:, None], 0, probe.finite_or_0(s.weight))
 
     def value(wo: Array) -> Array:
@@ -307,4 +342,5 @@ def _apart(case: Case, view: View, cells: Cells, s: Lanes) -> float:
     sigma = np.sqrt(error**2 + integrals.variance.sum(axis=0))
     beyond = np.maximum(abs(by_samples - by_quadrature) - SIGMAS * sigma, 0)
     larger = np.maximum(by_samples, by_quadrature)
-    return (beyond / np.maximum(larger, 1e-3)).max()
+    single, _ = _mean(np.where(s.delta[:, None], s.weight, 0))
+    return (beyond / np.maximum(larger, 1e-3)).max(), (by_quadrature + single).max()

@@ -9,10 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.validation.laws import noise, probe
-from mrt_mitsuba.validation.laws.bsdf_case import POINTWISE, Case, changed, parameters
-from mrt_mitsuba.validation.laws.bsdf_snippets import SAMPLE, VALUE
-from mrt_mitsuba.validation.laws.faults import (
+from . import noise, plots, probe
+from .bsdf_case import POINTWISE, BsdfCase, changed, parameters
+from .bsdf_snippets import SAMPLE, VALUE
+from .case import READS, READS_WHY, judge_many, reads_checked
+from .faults import (
     GLASS,
     GLOSS,
     larger,
@@ -23,19 +24,18 @@ from mrt_mitsuba.validation.laws.faults import (
     of_weight,
     put,
 )
-from mrt_mitsuba.validation.laws.law import (
-    FEWEST,
-    Figure,
-    Law,
+from .law import (
+    MIN_QUANTILE_ERRORS,
+    Criterion,
+    Outcome,
     Skip,
     at_least,
-    figures,
     finds,
+    measures,
     most,
     number_of,
 )
-from mrt_mitsuba.validation.laws.probe import BEYOND, Array, Lanes, context, excess, is_scalar, unit
-from mrt_mitsuba.validation.laws.subject import judge_many
+from .probe import BEYOND, Array, Lanes, context, excess, is_scalar, method, unit
 
 TWO_WAYS = "two ways to the same number"
 
@@ -50,7 +50,9 @@ def density_of_pair(size, pair, *_):
     return value, (1 + size) * pdf
 
 
-@figures(
+@finds("value", "value of eval_pdf() too large in one channel", 1e-4, pair=first_channel)
+@finds("density", "density of eval_pdf() too large", 2e-4, nested=GLOSS, pair=density_of_pair)
+@measures(
     value=most(f"value of eval_pdf() against that of eval(), {BEYOND}", 1e-4, TWO_WAYS, VALUE),
     density=most(f"density of eval_pdf() against that of pdf(), {BEYOND}", 1e-4, TWO_WAYS, VALUE),
     inactive=number_of(
@@ -60,9 +62,7 @@ def density_of_pair(size, pair, *_):
         VALUE,
     ),
 )
-@finds("value", "value of eval_pdf() too large in one channel", 1e-4, pair=first_channel)
-@finds("density", "density of eval_pdf() too large", 2e-4, nested=GLOSS, pair=density_of_pair)
-def eval_pdf(law: Law, case: Case) -> None:
+def eval_pdf(law: Outcome, case: BsdfCase) -> None:
     """``eval_pdf`` returns what ``eval`` and ``pdf`` do; values are 0 where ``active`` is False.
 
     Densities need not be: half of Mitsuba's plugins state one in any lane.
@@ -70,8 +70,8 @@ def eval_pdf(law: Law, case: Case) -> None:
     case.need_smooth()
     p = case.pairs
     value, pdf = case.pair(p)
-    law.hold("value", excess(value, p.value, p.value_off), p)
-    law.hold("density", excess(pdf, p.pdf, p.pdf_off), p)
+    law.check("value", excess(value, p.value, p.value_off), p)
+    law.check("density", excess(pdf, p.pdf, p.pdf_off), p)
 
     def switched_off(ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> list[mi.Spectrum]:
         no_lane = wo.z > 2
@@ -80,7 +80,7 @@ def eval_pdf(law: Law, case: Case) -> None:
 
     if not is_scalar():  # where Mitsuba takes ``active`` out of its plugins
         values = case.ask(switched_off, p)
-        law.hold("inactive", np.any(values, axis=(0, 2)), p)
+        law.check("inactive", np.any(values, axis=(0, 2)), p)
 
 
 RECIPROCITY = """eta = {eta}  # index of refraction at wo over that at wi
@@ -114,7 +114,12 @@ def by_importance(ctx, *_):
     return ctx.mode == mi.TransportMode.Importance
 
 
-@figures(
+@finds("swapped", "value that grows with the cosine of wi", 3e-3, value=with_cosine)
+@finds("modes", "more light in the mode of importance", 3e-3, value=by_importance)
+@finds("medium", "index of refraction of reflected light", 3e-7, sample=of_sample(member("eta", larger)))
+@finds("single", "more light through glass from one side", 3e-3, nested=GLASS, value=from_one_side)
+@finds("single_modes", "more light through glass by importance", 3e-3, nested=GLASS, value=by_importance)
+@measures(
     swapped=most(f"f(wi, wo) against f(wo, wi), {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY),
     modes=most(
         f"f in the mode of radiance against that of importance, {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY
@@ -139,12 +144,7 @@ def by_importance(ctx, *_):
         THERE_AND_BACK,
     ),
 )
-@finds("swapped", "value that grows with the cosine of wi", 3e-3, value=with_cosine)
-@finds("modes", "more light in the mode of importance", 3e-3, value=by_importance)
-@finds("medium", "index of refraction of reflected light", 3e-7, sample=of_sample(member("eta", larger)))
-@finds("single", "more light through glass from one side", 3e-3, nested=GLASS, value=from_one_side)
-@finds("single_modes", "more light through glass by importance", 3e-3, nested=GLASS, value=by_importance)
-def reciprocity(law: Law, case: Case) -> None:
+def reciprocity(law: Outcome, case: BsdfCase) -> None:
     """f(ωi, ωo) η_o² = f(ωo, ωi) η_i², with the indices of refraction on either side.
 
     E. Veach, Robust Monte Carlo Methods for Light Transport Simulation, 1997, § 5.2.
@@ -161,19 +161,22 @@ def reciprocity(law: Law, case: Case) -> None:
         return case.eval(at, context(importance=True)) / abs(at.wo[:, 2:])
 
     value = forth(pairs)
+    swapped = back(pairs)
     allowed = case.spread(forth, pairs)
-    for name, other in (("swapped", back), ("modes", importance)):
-        error = excess(value, other(pairs), allowed + case.spread(other, pairs))
-        law.hold(name, error, pairs)
+    for name, other, expected in (("swapped", back, swapped), ("modes", importance, importance(pairs))):
+        error = excess(value, expected, allowed + case.spread(other, pairs))
+        law.check(name, error, pairs)
+    if not law.holds:
+        law.plot = partial(plots.swapped, value[:3000].max(axis=1), swapped[:3000].max(axis=1))
     _delta_either_way(law, case)
     # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
     s = case.drawn
     reflected = ((s.flags & mi.BSDFFlags.Reflection) != 0) & s.lit
     if reflected.any():
-        law.hold("medium", abs(s.eta - 1), s, where=reflected)
+        law.check("medium", abs(s.eta - 1), s, where=reflected)
 
 
-def _delta_either_way(law: Law, case: Case) -> None:
+def _delta_either_way(law: Outcome, case: BsdfCase) -> None:
     """Lobes of one direction: probability × weight × η² of a sample, and of the one that goes back."""
     at = case.at_random(2**13, 2**15)
     at.back = case.uniform(len(at.wi), 3)
@@ -184,10 +187,10 @@ def _delta_either_way(law: Law, case: Case) -> None:
     same = forth.delta & (forth.flags == back.flags) & (forth.lobe == back.lobe)
     same &= abs(at.wi[:, 2] * there.wo[:, 2]) > 1e-3
     returned = (abs(unit(back.wo) - at.wi) < 1e-3).all(axis=1)
-    if same.sum() < FEWEST:
+    if same.sum() < MIN_QUANTILE_ERRORS:
         return
     lost = (same & ~returned).argmax()
-    law.hold("returns", returned[same].mean(), at[lost])
+    law.check("returns", returned[same].mean(), at[lost])
 
     def followed(at: Lanes) -> Array:
         s = case.sample(at)
@@ -196,11 +199,11 @@ def _delta_either_way(law: Law, case: Case) -> None:
     # next to total reflection, a rounding of the direction is a percent of what is transmitted
     allowed = case.spread(followed, there) + case.spread(followed, and_back)
     error = excess(followed(there), followed(and_back), allowed)
-    law.hold("single", error, at, where=same & returned)
+    law.check("single", error, at, where=same & returned)
     other = case.sample(at, context(importance=True))  # by the same random numbers
     alike = forth.delta & (abs(other.wo - forth.wo) < 1e-3).all(axis=1)
     error = excess(forth.weight * forth.eta[:, None] ** 2, other.weight)
-    law.hold("single_modes", error, at, where=alike)
+    law.check("single_modes", error, at, where=alike)
 
 
 # A dot product of float32 vectors is rarely less than 1e-7
@@ -224,7 +227,12 @@ def negative_next_to_normal(size, value, ctx, wi, wo):
     return dr.select(dr.minimum(wi.z, wo.z) > 1 - size, -1, 1) * value
 
 
-@figures(
+@finds("samples", "NaN for the last random numbers, this share", 1e-6, sample=of_weight(no_number_at_the_end))
+@finds("million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=of_weight(no_number))
+@finds("million", "direction NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=no_direction)
+@finds("values", "negative value where both cosines are so near to 1", 1e-6, value=negative_next_to_normal)
+@measures(
+    reads=most(READS, 0, READS_WHY),
     values=number_of(WRONG, 0, SPOILS, VALUE),
     samples=number_of(WRONG, 0, SPOILS, SAMPLE),
     million=most(
@@ -234,23 +242,20 @@ def negative_next_to_normal(size, value, ctx, wi, wo):
         SAMPLE,
     ),
 )
-@finds("samples", "NaN for the last random numbers, this share", 1e-6, sample=of_weight(no_number_at_the_end))
-@finds("million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=of_weight(no_number))
-@finds("million", "direction NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=no_direction)
-@finds("values", "negative value where both cosines are so near to 1", 1e-6, value=negative_next_to_normal)
-def finite(law: Law, case: Case) -> None:
+def finite(law: Outcome, case: BsdfCase) -> None:
     """No NaN, infinity or negative number, for extreme directions, random numbers and parameters."""
     extremes = _extremes(case)
-    sound = _finite(law, case, extremes)
-    judge_many(law, case, partial(_at_random, case))
-    for key, value in parameters(case) if sound else ():
-        for end in _ends(key, float(np.mean(np.array(value)))):  # one parameter at a time
-            copy = case.copy()
-            with changed(copy, key, factor=0, summand=end):
-                _finite(law, copy, extremes, (key, end))
+    with reads_checked(law):
+        sound = _finite(law, case, extremes)
+        judge_many(law, case, partial(_at_random, case))
+        for key, value in parameters(case) if sound else ():
+            for end in _ends(key, float(np.mean(np.array(value)))):  # one parameter at a time
+                copy = case.copy()
+                with changed(copy, key, factor=0, summand=end):
+                    _finite(law, copy, extremes, (key, end))
 
 
-def _extremes(case: Case) -> Lanes:
+def _extremes(case: BsdfCase) -> Lanes:
     """Directions, random numbers ``u`` and ``uv`` at and between the ends of their ranges."""
     rng = case.rng
     count = case.count(2**14, 2**17)
@@ -275,7 +280,7 @@ def _ends(key: str, number: float) -> tuple[float, float]:
     return (0.0, 1.0) if 0 <= number <= 1 else (1.001, 2 * number)
 
 
-def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None = None) -> bool:
+def _finite(law: Outcome, case: BsdfCase, at: Lanes, setting: tuple[str, float] | None = None) -> bool:
     """Hold the faults of values, or those of samples where values have none; return whether all is sound."""
     value, pdf = case.both(at)
     s = case.sample(at)
@@ -297,7 +302,7 @@ def _finite(law: Law, case: Case, at: Lanes, setting: tuple[str, float] | None =
         with_setting = f" with {setting[0]} = {setting[1]:g}" if setting else ""
         name = "values" if wrong_values else "samples"
         faults = np.any([*kinds.values()], axis=0)
-        law.hold(name, faults, at, setting=setting, with_setting=with_setting, faults=words or "none")
+        law.check(name, faults, at, setting=setting, with_setting=with_setting, faults=words or "none")
     return not words
 
 
@@ -307,12 +312,13 @@ def _bad(values: Array) -> Array:
     return ~sound.reshape(len(values), -1).all(axis=1)
 
 
-def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
+def _at_random(case: BsdfCase, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
     """Ordinary samples from all directions, and which of them are not finite, or negative."""
     wi = mi.warp.square_to_uniform_sphere(mi.Point2f(draw(), draw()))
     uv = mi.Point2f(draw(), draw())
     u = mi.Point3f(draw(), draw(), draw())
-    bs, weight = case.plugin.sample(context(), probe.interaction(wi, uv), u.x, mi.Point2f(u.y, u.z))
+    sample = method(case.plugin, "sample")
+    bs, weight = sample(context(), probe.interaction(wi, uv), u.x, mi.Point2f(u.y, u.z))
     weight = mi.unpolarized_spectrum(weight)
     lit = dr.any(weight != 0)
     value, pdf = case.plugin.eval_pdf(context(), probe.interaction(wi, uv), bs.wo, lit)
@@ -332,24 +338,24 @@ def stairs_on_slope(size, value, ctx, wi, wo):
     return value * (1 + size * (dr.round(slope) - slope))
 
 
-@figures(
-    lost=Figure(
+@finds("lost", "stairs on a slope, of this height", 1e-4, value=stairs_on_slope)
+@measures(
+    lost=Criterion(
         0.9,
         "noise of {function}() over that of 8 roundings with rounded directions, 9 in 10",
-        noise.LOST,
+        noise.MAX_NOISE,
         "sound formulas stay below 1.6; beyond, digits are lost",
         NOISE,
     )
 )
-@finds("lost", "stairs on a slope, of this height", 3e-4, value=stairs_on_slope)
-def roundoff(law: Law, case: Case) -> None:
+def roundoff(law: Outcome, case: BsdfCase) -> None:
     """Float32 evaluation loses no more digits than the rounding of directions explains (``noise``)."""
     case.need_smooth()
     p = case.pairs
     steep = (abs(p.wi[:, 2]) > 0.1) & (abs(p.wo[:, 2]) > 0.1)
     # far off a lobe, an exponent of 40 makes 40 roundings of one: of nothing
     few = case.few(p[steep & (p.pdf > 1e-3) & (p.value.max(axis=1) > 1e-20)], 500, 2000)
-    if len(few.pdf) < FEWEST:
+    if len(few.pdf) < MIN_QUANTILE_ERRORS:
         raise Skip("too few pairs of directions with a value")
     inputs = np.column_stack([few.wi, few.wo])
 
@@ -367,4 +373,4 @@ def roundoff(law: Law, case: Case) -> None:
         estimate = noise.measure(partial(values, function), inputs, seed=case.seed, project=both_unit)
         if np.isnan(estimate.noise).mean() > 0.25:
             raise Skip("values change too fast for float32 steps to tell noise")
-        law.hold("lost", estimate.lost, few, function=name, stride=estimate.stride)
+        law.check("lost", estimate.lost, few, function=name, stride=estimate.stride)

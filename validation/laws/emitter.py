@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable
 from functools import cached_property, partial
 
@@ -12,24 +11,27 @@ import numpy as np
 from numpy.linalg import norm
 from scipy import stats
 
-from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.compare import sidak
-from mrt_mitsuba.validation.laws import probe
-from mrt_mitsuba.validation.laws.examine import TIMEOUT, Check, examine
-from mrt_mitsuba.validation.laws.faults import DEGREE, PLACE, larger, no_number, put
-from mrt_mitsuba.validation.laws.law import (
-    LEVEL,
-    Law,
+from . import probe
+from .case import READS, READS_WHY, Case, Given, judge_many, reads_checked
+from .examine import TIMEOUT, Check, examine
+from .faults import DEGREE, PLACE, larger, no_number, put
+from .law import (
+    SIGMAS,
+    SIGNIFICANCE,
+    Outcome,
     Skip,
-    figures,
+    UsageError,
+    by_name,
     finds,
-    laws_in,
+    measures,
     most,
     number_of,
-    rare,
+    p_value,
+    sidak,
 )
-from mrt_mitsuba.validation.laws.probe import BEYOND, Array, Lanes, excess, lanes
-from mrt_mitsuba.validation.laws.sphere import (
+from .probe import BEYOND, Array, Lanes, excess, lanes, method
+from .shape_case import CONE, View, alone
+from .sphere import (
     SMALL,
     Cells,
     chances_of,
@@ -39,16 +41,15 @@ from mrt_mitsuba.validation.laws.sphere import (
     integrate,
     least_of,
 )
-from mrt_mitsuba.validation.laws.subject import Given, Subject, judge_many
 
-SAME = 1e-3  # relative: the same formula, evaluated once more
-TURNED = 4 * probe.ROUNDED  # a direction passes through angles, a transform, and back
+REEVALUATION_TOL = 1e-3  # relative: the same formula, evaluated once more
+DIRECTION_TOL = 4 * probe.ROUNDED  # a direction passes through angles, a transform, and back
 SPOILS = "one such number spoils a picture"
 LENGTH = 1e-4  # relative: a square root, and the difference of two points
-DOUBT = 1e-3  # chance below which the integral over a cell is made again
+RETRY_P_VALUE = 1e-3  # chance below which the integral over a cell is made again
 REPEATS = 64
 BATCH = 256  # cells of which it is made again at a time
-DARK = 5e-5  # share of the light: a fifth of a cone of 3 degrees
+MAX_UNSAMPLED_LIGHT = 5e-5  # share of the light: a fifth of a cone of 3 degrees
 
 
 def check_emitter(
@@ -65,14 +66,14 @@ def check_emitter(
     ``scene``: the one that a loaded emitter belongs to; else it lights a sphere of radius 1, and what lights
     from a surface does so from a square above it. A dict may also be of a shape with an emitter. ``quick``:
     fewer samples. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law fails that is not done.
-    Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
+    Raises ``UsageError`` for anything else, and ``LoadError`` for a dict that Mitsuba cannot load.
     """
-    case = partial(Case, scene=scene)
+    case = partial(EmitterCase, scene=scene)
     return examine(case, emitter, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
 
 
-class Case(Subject):
-    """An emitter of a scene, and points in and about its box from which it is looked at [N, 3]."""
+class EmitterCase(Case):
+    """An emitter of a scene, and points in and around its box from which it is looked at [N, 3]."""
 
     word = "emitter"
 
@@ -84,17 +85,19 @@ class Case(Subject):
         if not isinstance(self.plugin, mi.Emitter):
             kind = type(self.plugin).__name__
             raise UsageError(f"{kind} is not an emitter of {mi.variant()}: give a dict or a loaded emitter")
-        alone = scene is None
         self.lit = scene or self._lit_sphere()  # an emitter keeps neither its scene nor its shape alive
         low, high = np.nan_to_num(probe.corners(self.lit), posinf=1, neginf=-1)
-        outer = 0.1 * (high - low)
+        size = float(norm(high - low))
+        outer = 0.1 * size  # also across a flat box
         self.points = np.float32(self.rng.uniform(low - outer, high + outer, (2**12, 3)))
-        if alone:
-            self._look_from_the_light(float(norm(high - low)))
+        self._look_from_the_light(size)
         flags = self.plugin.flags()
-        # whether light comes from all around, and not from single directions, a surface or a point
-        infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
-        self.around = infinite and not mi.has_flag(flags, mi.EmitterFlags.Delta)
+        delta = mi.has_flag(flags, mi.EmitterFlags.Delta) or mi.has_flag(
+            flags, mi.EmitterFlags.DeltaDirection
+        )
+        # whether light comes from all around, or from a surface, and not from single directions or a point
+        self.around = mi.has_flag(flags, mi.EmitterFlags.Infinite) and not delta
+        self.lamp = mi.has_flag(flags, mi.EmitterFlags.Surface) and not delta
 
     def _lit_sphere(self) -> mi.Scene:
         """A scene with the emitter and a sphere; what lights from a surface lights from a square."""
@@ -123,7 +126,7 @@ class Case(Subject):
         columns = ("Float", u[:, 0]), ("Point2f", u[:, 1:3]), ("Point2f", u[:, 3:]), ("Float", reach)
         try:
             (points,) = lanes(along, *columns)
-        except (NotImplementedError, RuntimeError):
+        except Exception:  # none of its laws asks for rays
             return
         usable = np.isfinite(points).all(axis=1)
         self.points[:half][usable] = points[usable]
@@ -135,33 +138,58 @@ class Case(Subject):
 
     def sample(self, points: Array) -> Lanes:
         """A sample for each point; ``again``: pdf_direction(), ``value``: eval_direction()."""
+        sample = method(self.plugin, "sample_direction")
+        light = method(self.plugin, "eval_direction")
+        density = method(self.plugin, "pdf_direction")
 
         def call(p: mi.Point3f, u: mi.Point2f) -> list[mi.Float]:
             it = _seen_from(p)
-            ds, weight = self.plugin.sample_direction(it, u)
-            value = self.plugin.eval_direction(it, ds)
-            again = self.plugin.pdf_direction(it, ds)
-            return [ds.p, ds.d, ds.dist, ds.pdf, again, ds.delta, weight, value]
+            ds, weight = sample(it, u)
+            return [ds.p, ds.d, ds.dist, ds.pdf, density(it, ds), ds.delta, weight, light(it, ds)]
 
+        u = self.uniform(len(points), 2)
         try:
-            columns = lanes(call, ("Point3f", points), ("Point2f", self.uniform(len(points), 2)))
+            columns = lanes(call, ("Point3f", points), ("Point2f", u))
         except (NotImplementedError, RuntimeError) as error:
+            if not type(self.plugin).__module__.startswith("mitsuba"):
+                raise
             raise Skip("directions cannot be sampled") from error
-        s = probe.named("p d dist pdf again delta weight value", columns)
+        s = probe.named("p d dist pdf again delta weight value", columns).having(point=points, u=u)
         s.lit = (s.weight != 0).any(axis=1)
         return s
 
     def seen(self, d: Array) -> list[Array]:
         """The density of directions [N] and the light that is seen there [N, channels]."""
+        sample = method(self.plugin, "sample_direction")
+        density = method(self.plugin, "pdf_direction")
+        seen = method(self.plugin, "eval")
 
         def call(d: mi.Vector3f) -> list[mi.Float]:
             it = self.from_first()
-            ds, _ = self.plugin.sample_direction(it, mi.Point2f(0.5))
+            ds, _ = sample(it, mi.Point2f(0.5))
             ds.d = d
             it.wi = -d
-            return [self.plugin.pdf_direction(it, ds), self.plugin.eval(it)]
+            return [density(it, ds), seen(it)]
 
         return lanes(call, ("Vector3f", d))
+
+    def met(self, o: Array, d: Array) -> list[Array]:
+        """What rays meet of a lamp: whether, where, eval() and eval_direction() there."""
+        seen = method(self.plugin, "eval")
+        light = method(self.plugin, "eval_direction")
+
+        def call(origin: mi.Point3f, direction: mi.Vector3f) -> list[mi.Float]:
+            it = _seen_from(origin)
+            si = probe.at_wavelengths(self.surface.ray_intersect(mi.Ray3f(origin, direction)))
+            ds = mi.DirectionSample3f(self.surface, si, it)
+            return [si.is_valid(), si.t, seen(si), light(it, ds)]
+
+        return lanes(call, ("Point3f", o), ("Vector3f", d))
+
+    @cached_property
+    def surface(self) -> mi.Scene:
+        """A scene with the shape of a lamp alone."""
+        return alone(self.plugin.get_shape())
 
     def from_first(self) -> mi.SurfaceInteraction3f:
         """The first of the points."""
@@ -177,7 +205,7 @@ class Case(Subject):
         s = self.samples
         if not self.around:
             return np.zeros_like(s.pdf), np.zeros_like(s.value)
-        off = probe.spread(lambda d: np.column_stack(self.seen(d)), [s.d], self.rng, TURNED)
+        off = probe.spread(lambda d: np.column_stack(self.seen(d)), [s.d], self.rng, DIRECTION_TOL)
         return off[:, 0], off[:, 1:]
 
 
@@ -187,15 +215,17 @@ def _seen_from(p: mi.Point3f) -> mi.SurfaceInteraction3f:
     return probe.at_wavelengths(it)
 
 
-@figures(same=most(f"density of a direction against pdf_direction(), {BEYOND}", SAME, "one number"))
 @finds("same", "pdf_direction() too large", 3e-3, pdf=larger)
-def density(law: Law, case: Case) -> None:
+@measures(
+    same=most(f"density of a direction against pdf_direction(), {BEYOND}", REEVALUATION_TOL, "one number")
+)
+def density(law: Outcome, case: EmitterCase) -> None:
     """The density that a sample states is ``pdf_direction``."""
     s = case.samples
     judged = s.lit & ~s.delta
     if not judged.any():
         raise Skip("light comes from single directions (delta), or none was sampled")
-    law.hold("same", excess(s.pdf, s.again, case.spread[0]), where=judged)
+    law.check("same", excess(s.pdf, s.again, case.spread[0]), where=judged)
 
 
 def in_hole(size, d):
@@ -219,19 +249,6 @@ def no_density_of_sample(size, ds, u):
     return put(ds, pdf=nothing_in_hole(size, ds.pdf, ds))
 
 
-@figures(
-    place=most(
-        "sampled point off the stated direction and distance, relative", LENGTH, "one place, said in two ways"
-    ),
-    counts=rare("chance of such counts if directions follow pdf_direction()"),
-    small=rare("chance of such counts in cells of a degree, for their number"),
-    slices=rare("chance of such counts in slices of a degree or two, for their number"),
-    dark=number_of(
-        "share of the light, from all around, whose density is 0",
-        DARK,
-        "light that samples never find is missing from the picture",
-    ),
-)
 @finds("small", "no samples in a cone, in degrees", 3, direction=around_hole)
 @finds("small", "samples without weight in a cone, in degrees", 3, weight=nothing_in_hole)
 @finds(
@@ -241,7 +258,26 @@ def no_density_of_sample(size, ds, u):
     direction=no_density_of_sample,
     pdf=nothing_in_hole,
 )
-def sampling(law: Law, case: Case) -> None:
+@measures(
+    place=most(
+        "sampled point off the stated direction and distance, relative", LENGTH, "one place, said in two ways"
+    ),
+    counts=p_value("chance of such counts if directions follow pdf_direction()"),
+    small=p_value("chance of such counts in cells of a degree, for their number"),
+    slices=p_value("chance of such counts in slices of a degree or two, for their number"),
+    light=most(
+        "light of a lamp by samples against by rays in all directions, relative, beyond "
+        f"{SIGMAS} standard errors",
+        1e-2,
+        "one integral, of weights and of eval(): samples, densities and what is seen agree",
+    ),
+    dark=number_of(
+        "share of the light, from all around, whose density is 0",
+        MAX_UNSAMPLED_LIGHT,
+        "light that samples never find is missing from the picture",
+    ),
+)
+def sampling(law: Outcome, case: EmitterCase) -> None:
     """p = o + dist · d; directions to light from all around follow their density (Pearson's χ²)."""
     s = case.samples
     if not s.lit.any():
@@ -249,9 +285,10 @@ def sampling(law: Law, case: Case) -> None:
     points = np.float64(case.points)
     scale = abs(s.dist) + abs(points).max(axis=1)
     off = norm(s.p - points - s.dist[:, None] * s.d, axis=1)
-    law.hold("place", np.nan_to_num(off / scale), where=s.lit)
+    law.check("place", np.nan_to_num(off / scale), where=s.lit)
+    if case.lamp:
+        law.check("light", _by_samples_and_by_rays(case))
     if not case.around:
-        law.notes.append("directions to surfaces are judged with their shapes")
         return
     count = 2**12 if probe.is_scalar() else 2**18
     codes = encode(case.sample(np.repeat(case.points[:1], count, axis=0)).d)
@@ -261,16 +298,32 @@ def sampling(law: Law, case: Case) -> None:
     integrals = integrate(case.density, cells, case.rng, codes, len(codes))
     tests, _ = chi_square(integrals, codes, len(codes))
     chances = stats.chi2.sf(*tests.T)
-    law.hold("counts", sidak(chances.min(), len(chances)))
+    law.check("counts", sidak(chances.min(), len(chances)))
     rng = np.random.default_rng((case.seed, 2))
     anywhere = probe.unit(rng.normal(size=(case.count(2**18, 2**20), 3)))
     pdf, value = case.seen(anywhere)
-    law.hold("dark", probe.without_density(value, pdf))
+    law.check("dark", probe.without_density(value, pdf))
     if not probe.is_scalar():
         _in_small_cells(law, case)
 
 
-def _in_small_cells(law: Law, case: Case) -> None:
+def _by_samples_and_by_rays(case: EmitterCase) -> float:
+    """How far the light of a lamp on points around it differs by samples and by uniform rays, relative."""
+    view = View(probe.corners(case.surface))
+    o = view.around(case, case.count(2**15, 2**17))
+    s = case.sample(o)
+    met, t, _, _ = case.met(o, s.d)
+    visible = met & (t > s.dist * (1 - 1e-3))
+    by_samples = np.where(visible & s.lit, probe.finite_or_0(s.weight).sum(axis=1), 0)
+    o = view.around(case, case.count(2**17, 2**19))
+    met, _, value, _ = case.met(o, view.into_cone(o, case.rng))
+    by_rays = np.where(met, probe.finite_or_0(value).sum(axis=1) * CONE, 0)
+    means = by_samples.mean(), by_rays.mean()
+    error = np.hypot(by_samples.std() / len(by_samples) ** 0.5, by_rays.std() / len(by_rays) ** 0.5)
+    return float(max(abs(means[0] - means[1]) - SIGMAS * error, 0) / max(*means, 1e-30))
+
+
+def _in_small_cells(law: Outcome, case: EmitterCase) -> None:
     """Directions in cells of a degree and in slices, for places that are never sampled."""
     count = case.count(2**21, 2**23)
     cells = Cells.uniform(SMALL)
@@ -280,17 +333,17 @@ def _in_small_cells(law: Law, case: Case) -> None:
         seen += cells.counts(encode(_directions(case, rng.random((2**20, 2), np.float32))))
     counts = np.array([seen, *cells.expected(case.density, count, rng)])
     # a corner of a bright texel may lie between the points of a cell
-    (doubtful,) = np.nonzero(chances_of(counts, SAME) < DOUBT)
+    (doubtful,) = np.nonzero(chances_of(counts, REEVALUATION_TOL) < RETRY_P_VALUE)
     for first in range(0, len(doubtful), BATCH):
         batch = doubtful[first : first + BATCH]
         again = np.array(cells[np.tile(batch, REPEATS)].expected(case.density, count, rng))
         counts[1:, batch] = again.reshape(2, REPEATS, -1).mean(axis=1)
-        if least_of(chances_of(counts[:, batch], SAME), len(counts[0])) < LEVEL:
+        if least_of(chances_of(counts[:, batch], REEVALUATION_TOL), len(counts[0])) < SIGNIFICANCE:
             break  # the law fails, whatever the other cells hold: half of the sky would take half a minute
-    hold_small(law, cells, counts, SAME)
+    hold_small(law, cells, counts, REEVALUATION_TOL)
 
 
-def _directions(case: Case, u: Array) -> Array:
+def _directions(case: EmitterCase, u: Array) -> Array:
     """Sampled directions from one point, by random numbers [N, 2], without those refused in the light."""
 
     def call(u: mi.Point2f) -> list[mi.Float]:
@@ -304,25 +357,34 @@ def _directions(case: Case, u: Array) -> Array:
     return d[~refused]
 
 
-@figures(
-    weight=most(f"weight against eval_direction() / density, {BEYOND}", SAME, "one number"),
-    seen=most(f"eval() where it is seen against eval_direction(), {BEYOND}", SAME, "one number"),
-)
 @finds("weight", "weight of a sample too large", 3e-3, weight=larger)
-def weights(law: Law, case: Case) -> None:
+@measures(
+    weight=most(f"weight against eval_direction() / density, {BEYOND}", REEVALUATION_TOL, "one number"),
+    seen=most(f"eval() where it is seen against eval_direction(), {BEYOND}", REEVALUATION_TOL, "one number"),
+)
+def weights(law: Outcome, case: EmitterCase) -> None:
     """weight · pdf is ``eval_direction``, the light that is seen there."""
     s = case.samples
     allowed = case.spread[1]
     counts = s.lit & (s.pdf > 0) & np.isfinite(s.weight).all(axis=1)
     if not counts.any():
         raise Skip("no sample carries light")
-    law.hold("weight", excess(s.weight * s.pdf[:, None], s.value, allowed), where=counts)
+    law.check("weight", excess(s.weight * s.pdf[:, None], s.value, allowed), where=counts)
     if case.around:
         _, value = case.seen(s.d)
-        law.hold("seen", excess(value, s.value, allowed), where=counts)
+        law.check("seen", excess(value, s.value, allowed), where=counts)
+    if not case.around and not case.lamp:  # renders call it all the same
+        method(case.plugin, "eval")(case.from_first())
+    if case.lamp:
+        low, high = probe.corners(case.surface)
+        goals = case.rng.uniform(low, high, case.points.shape)
+        met, _, value, light = case.met(case.points, probe.unit(goals - case.points))
+        law.check("seen", excess(value, light), where=met)
 
 
-@figures(
+@finds("million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number)
+@measures(
+    reads=most(READS, 0, READS_WHY),
     bad=number_of("samples that are not finite, or negative, or not of unit length", 0, SPOILS),
     million=most(
         "samples of {count} from one point that are not finite, or negative, or whose direction is not of "
@@ -331,23 +393,23 @@ def weights(law: Law, case: Case) -> None:
         SPOILS,
     ),
 )
-@finds("million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number)
-def finite(law: Law, case: Case) -> None:
+def finite(law: Outcome, case: EmitterCase) -> None:
     """Samples are finite, directions have unit length, and weights and densities are not negative."""
-    s = case.samples
-    sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
-    length = abs(norm(np.float64(s.d), axis=1) - 1)
-    usable = (length <= LENGTH) & np.isfinite(s.dist) & (s.pdf >= 0)
-    law.hold("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable))
-    judge_many(law, case, partial(_at_random, case))
+    with reads_checked(law):
+        s = case.sample(case.points)
+        sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
+        length = abs(norm(np.float64(s.d), axis=1) - 1)
+        usable = (length <= LENGTH) & np.isfinite(s.dist) & (s.pdf >= 0)
+        law.check("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable))
+        judge_many(law, case, partial(_at_random, case))
 
 
-def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
+def _at_random(case: EmitterCase, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
     """Samples from one point, and which of them are not finite, or negative."""
     it = case.from_first()
-    ds, weight = case.plugin.sample_direction(it, mi.Point2f(draw(), draw()))
+    ds, weight = method(case.plugin, "sample_direction")(it, mi.Point2f(draw(), draw()))
     weight = mi.unpolarized_spectrum(weight)
     return probe.bad_samples(weight, ds.d, ds.pdf, ds.dist), {}
 
 
-LAWS = laws_in(sys.modules[__name__])
+LAWS = by_name(density, sampling, weights, finite)

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
-import math
+import io
 import re
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.laws.law import Judge, Law, Part, Skip
-from mrt_mitsuba.validation.laws.subject import Given, Subject
-from mrt_mitsuba.validation.page import notebook, save_report
-from mrt_mitsuba.validation.study import Study
+from . import page
+from .case import Case, Given, reason_of
+from .law import Law, Outcome, Skip, UsageError
 
-TITLE = "Laws of plugins"
 TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
 
 
@@ -38,7 +34,7 @@ class Check:
 
     subject: str
     variant: str
-    laws: Mapping[str, Law]
+    laws: Mapping[str, Outcome]
     seconds: float
     quick: bool = False
 
@@ -50,38 +46,30 @@ class Check:
     @property
     def passed(self) -> bool:
         """Whether something was checked and every law that was checked holds."""
-        return not self.failed and any(not law.skipped for law in self.laws.values())
+        return not self.failed and any(law.parts for law in self.laws.values())
+
+    @property
+    def verdict(self) -> str:
+        if self.failed:
+            return f"FAILED {', '.join(self.failed)}"
+        return "passed" if self.passed else "skipped, nothing could be checked"
 
     def __str__(self) -> str:
-        verdict = "passed" if self.passed else "skipped, nothing could be checked"
-        if self.failed:
-            verdict = f"FAILED {', '.join(self.failed)}"
-        title = f"{self.subject} in {self.variant}: {verdict} ({self.seconds:.1f} s)"
+        title = f"{self.subject} in {self.variant}: {self.verdict} ({self.seconds:.1f} s)"
         return "\n".join([title, *(f"  {law}" for law in self.laws.values())])
 
-    def study(self) -> Study:
-        """The findings in the form that pages are made of."""
-        study = Study(self.subject, f"{self.subject}, {self.variant}", seconds=self.seconds)
-        rows = []
-        for law in self.laws.values():
-            study.bounds += [replace(part, name=f"{law.name}: {part.name}") for part in law.parts]
-            row = {"law": law.name, "verdict": law.verdict, "note": law.skipped or law.note}
-            rows.append(row | {"the worst case, to run by itself": "" if law.holds else law.snippet})
-        study.records("laws", "Laws", rows, first=True)
-        return study
-
     def save(self, folder: str | Path) -> None:
-        """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
-        save_report(folder, self.study(), title=TITLE, quick=self.quick)
+        """Write a page (``index.html``), ``summary.json`` and ``laws.csv``. Raises ``OSError``."""
+        page.write(folder, page.files({self.subject: self}, f"Laws of plugins: {self.subject}"))
 
     def _repr_html_(self) -> str:
-        return notebook(self.study(), title=TITLE)
+        return page.frame({self.subject: self}, f"Laws of plugins: {self.subject}")
 
 
 def examine(
-    kind: Callable[[Given, bool, int], Subject],
+    kind: Callable[[Given, bool, int], Case],
     given: Given,
-    laws: Mapping[str, Judge],
+    laws: Mapping[str, Law],
     *,
     quick: bool,
     seed: int,
@@ -92,7 +80,8 @@ def examine(
 
     ``kind(given, quick, seed)`` makes the case that each law is called with.
     """
-    runtime.use()
+    if not mi.variant():
+        mi.set_variant("llvm_ad_rgb")
     chosen = list(laws if only is None else only)
     for name in chosen:
         if name not in laws:
@@ -105,42 +94,51 @@ def examine(
     obstacle = case.unsupported  # why the laws that are left cannot be judged
     for name in laws:
         if name in chosen:
-            law = Law(name, figures=vars(laws[name])["figures"], program=case.program)
-            obstacle = _judge(law, laws[name], case, obstacle, timeout)
-            law.program = None
-            checked[name] = law
+            checked[name] = outcome = Outcome(laws[name], program=case.program)
+            obstacle = _judge(outcome, case, obstacle, timeout)
+            outcome.program = None
     return Check(case.name, variant, checked, time.perf_counter() - start, quick)
 
 
-def _judge(law: Law, judge: Judge, case: Subject, obstacle: str, timeout: float) -> str:
+def _judge(outcome: Outcome, case: Case, obstacle: str, timeout: float) -> str:
     """Check one law, unless there is an obstacle; the obstacle for the laws after it, "" if none."""
     if obstacle:
-        law.skipped = obstacle
+        outcome.skip(obstacle)
         return obstacle
     try:
         with settings_restored(), _limited(timeout):
-            judge(law, case)
-        if not law.parts:
-            law.skipped = "; ".join(law.notes)
+            outcome.law.judge(outcome, case)
+            if not outcome.holds and outcome.snippet:
+                outcome.output = _run(outcome.snippet, {case.word: case.plugin})
+        if not outcome.parts:
+            outcome.skip("; ".join(outcome.notes) or "nothing of it could be measured")
     except Skip as why:
-        law.skipped = f"{why}: {_reason(why.__cause__)}" if why.__cause__ else str(why)
+        outcome.skip(f"{why}: {reason_of(why.__cause__)}" if why.__cause__ else str(why))
     except TimedOut:
         late = f"took longer than {timeout:g} s"
-        law.parts.append(Part(f"it {late}", math.inf, timeout, note="a plugin must come to an end"))
+        outcome.fail(f"it {late}", "a plugin must come to an end", timeout)
         return f"a law before it {late}"
     except Exception as error:
-        law.skipped = _missing_inside(case.plugin, error)
-        if not law.skipped:
-            what = f"it raised {type(error).__name__}: {_reason(error)}"
-            law.parts.append(Part(what, math.inf, 0, note="a plugin must not raise"))
+        missing = _missing_inside(case.plugin, error)
+        if missing:
+            outcome.skip(missing)
+        else:
+            outcome.fail(f"it raised {type(error).__name__}: {reason_of(error)}", "a plugin must not raise")
     return ""
 
 
-def _reason(problem: BaseException) -> str:
-    """The line of an error that says what happened: the last of a traceback that Mitsuba quotes."""
-    text = str(problem).strip()
-    lines = text.splitlines() or [""]
-    return lines[-1] if "Traceback (most recent" in text else lines[0]
+def _run(program: str, names: dict[str, object]) -> str:
+    """What a program prints, or the reason why it stops. Names are for those that cannot load the plugin."""
+    printed = io.StringIO()
+    both = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed)
+    with both[0], both[1], dr.scoped_set_flag(dr.JitFlag.Debug, True):
+        try:
+            exec(compile(program, "the program", "exec"), names)
+        except Exception as error:
+            print(f"{type(error).__name__}: {reason_of(error)}")
+        finally:
+            names.clear()  # its functions refer to it, and it to the plugin: a cycle keeps that registered
+    return printed.getvalue()
 
 
 _NOT_IMPLEMENTED = re.compile(r"\[(\w+)\] \w+::(\w+)\(\).*not implemented")
@@ -155,7 +153,7 @@ def _missing_inside(plugin: mi.Object, error: Exception) -> str:
     return f"the {match[1]} nested in it has no {match[2]}(), which it needs"
 
 
-@contextmanager
+@contextlib.contextmanager
 def settings_restored() -> Iterator[None]:
     """Put back the variant and Dr.Jit's flags, which a plugin or a switch of variants may change."""
     variant = mi.variant()
@@ -168,13 +166,13 @@ def settings_restored() -> Iterator[None]:
             yield
     finally:
         if mi.variant() != variant:
-            runtime.use(variant)
+            mi.set_variant(variant)
         for flag, value in flags.items():
             if dr.flag(flag) != value:
                 dr.set_flag(flag, value)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _limited(seconds: float) -> Iterator[None]:
     """Raise ``TimedOut`` in this thread's Python code after so many seconds. A kernel is not interrupted."""
     start = time.perf_counter()

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 GLASS = {"type": "dielectric"}
 GLOSS = {"type": "roughconductor", "alpha": 0.2}
+VEIL = {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse"}}
 SIZE = 2 * 3**0.5  # of the cube: its diagonal
 DEGREE = 0.01745
 PLACE = (0.48, 0.36, 0.8)  # a direction away from all axes

@@ -1,47 +1,50 @@
-"""What a law of plugins is: its figures, each with its limit and reason, and the faults that it must find.
+"""What a law of plugins is: criteria, each with its limit and reason, and the faults that it must find.
 
-A figure's ``snippet`` is a program in plain Mitsuba with the numbers of its worst case: ``Subject.program``
-puts before it what loads the plugin, and what the names of ``hold`` need.
+A criterion's ``snippet`` is a program in plain Mitsuba with the numbers of its worst case: ``Case.program``
+adds the lines that load the plugin, and those that the names given to ``Outcome.check`` need.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
-from types import FunctionType, ModuleType
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mrt_mitsuba.validation.laws.probe import Lanes
-from mrt_mitsuba.validation.study import Bound
+from .probe import Lanes
 
-LEVEL = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
+SIGNIFICANCE = 1e-6  # chance of a false alarm in each statistical test, after Šidák's correction
 ONE_IN_A_MILLION = "one false alarm in a million checks"
 SIGMAS = 6  # the same for a normal distribution: 2e-9
-FEWEST = 20  # errors of which a quantile says something
-NOWHERE = Lanes()
-Found = TypeVar("Found")
-Description = dict[str, Any]  # of a plugin, as ``mi.load_dict`` takes it
-Judge = Callable[..., None]  # checks one law of a case
-Change = Callable[..., Any]  # of a size, an answer of a plugin, and what was asked
+MIN_QUANTILE_ERRORS = 20  # a quantile of fewer is not judged
+NO_LANES = Lanes()
+Change = Callable[..., Any]  # a function of a size, of what a plugin returned, and of its arguments
+
+
+class UsageError(ValueError):
+    """An argument of a check is wrong."""
+
+
+class LoadError(RuntimeError):
+    """Mitsuba cannot load the dict of a plugin."""
 
 
 class Skip(Exception):
-    """Raised by the check of a law that makes no sense: the text says why, and an error that it is from."""
+    """Raised if a law does not apply, or cannot be checked here; the message says why."""
 
 
 @dataclass(frozen=True)
-class Figure:
-    """What a law measures, and the limit that it is held to.
+class Criterion:
+    """What a law measures, and the limit for it.
 
-    ``statistic``: a number "at least" the limit; or, of one or N errors, the "most", the "count" or the
-    "share" of those that are wrong, or a quantile (a float) without NaN: at most the limit. ``what`` and
-    ``snippet``, the body of a program that shows the worst case, have places for the names given to
-    ``Law.hold``.
+    ``statistic``: "at least" for a number of which the limit is the least; or, of one or N errors, the
+    "most", the "count" or the "share" of those that are wrong, or a quantile (a float) without NaN: at most
+    the limit. ``what`` and ``snippet``, the body of a program that shows the worst case, are formatted with
+    the names given to ``Outcome.check``.
     """
 
     statistic: str | float
@@ -52,141 +55,202 @@ class Figure:
 
 
 STATISTICS: dict[str | float, Callable[..., float]]
-STATISTICS = {"at least": np.min, "most": np.max, "count": np.sum, "share": np.mean}
+STATISTICS = {"at least": np.min, "most": np.max, "count": np.sum, "share": np.sum}
 
-# A figure by its statistic: what it is, its limit, the reason for that, and a snippet
-at_least = partial(Figure, "at least")
-most = partial(Figure, "most")
-number_of = partial(Figure, "count")
-share_of = partial(Figure, "share")
-
-
-def rare(what: str, snippet: str = "") -> Figure:
-    """The chance of what was seen, if a plugin is sound."""
-    return at_least(what, LEVEL, ONE_IN_A_MILLION, snippet)
+# A criterion by its statistic: what it is, its limit, the reason for that, and a snippet
+at_least = partial(Criterion, "at least")
+most = partial(Criterion, "most")
+number_of = partial(Criterion, "count")
+share_of = partial(Criterion, "share")
 
 
-def figures(**rows: Figure) -> Callable[[Found], Found]:
-    """Give a law the figures that it measures, by name."""
+def p_value(what: str, snippet: str = "") -> Criterion:
+    """p-value criterion, under the hypothesis that the plugin is correct."""
+    return at_least(what, SIGNIFICANCE, ONE_IN_A_MILLION, snippet)
 
-    def mark(law: Found) -> Found:
-        vars(law)["figures"] = rows
-        return law
 
-    return mark
+def sidak(p: float, count: int) -> float:
+    """The probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
+    return 1.0 if p >= 1 else float(-np.expm1(count * np.log1p(-p)))
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault in words, and the least size that a check finds, in full and ``quick``; infinity for none."""
+    """A fault, and the smallest size that a check finds, in full and ``quick``; infinity for none."""
 
     law: str
-    figure: str  # that finds it
+    criterion: str  # that finds it
     what: str
     full: float
     quick: float
-    changes: Mapping[str, Change]  # by the answer that they change
+    changes: Mapping[str, Change]  # by the method or value that they change
     nested: Mapping[str, Any] | None  # what is changed, if not a diffuse BSDF, a cube or a constant sky
 
 
+@dataclass(frozen=True)
+class Law:
+    """A law: the function that checks it, what that measures, and faults that it finds."""
+
+    judge: Callable[..., None]  # of an ``Outcome`` and a case
+    criteria: Mapping[str, Criterion]
+    faults: tuple[Fault, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return self.judge.__name__
+
+    @property
+    def states(self) -> str:
+        """The law in one sentence."""
+        return str(self.judge.__doc__).splitlines()[0]
+
+
+def measures(**criteria: Criterion) -> Callable[[Callable[..., None]], Law]:
+    """Declare a law by the function that checks it, with its criteria by name."""
+    return partial(Law, criteria=criteria)
+
+
 def finds(
-    figure: str,
+    criterion: str,
     what: str,
     full: float,
     *,
     quick: float | None = None,
     nested: Mapping[str, Any] | None = None,
     **changes: Change,
-) -> Callable[[Judge], Judge]:
-    """State a fault that a figure of this law finds. ``quick`` is ``full`` if left out.
+) -> Callable[[Law], Law]:
+    """State a fault that a criterion of this law finds. ``quick`` is ``full`` if left out.
 
     Of a BSDF, ``changes`` is one of ``value`` (values and weights), ``eval``, ``pdf``, ``pair`` (what
-    eval_pdf() alone returns), ``sample``, ``u`` (its random numbers) and ``context``; of a shape, any of its
-    methods; of a sky, any of ``direction``, ``weight``, ``pdf``, ``value`` (of eval_direction()) and ``seen``
-    (of eval()).
+    eval_pdf() alone returns), ``null`` (eval_null_transmission()), ``sample``, ``u`` (its random numbers) and
+    ``context``; of a shape, any of its methods; of a sky, any of ``direction``, ``weight``, ``pdf``,
+    ``value`` (of eval_direction()) and ``seen`` (of eval()).
     """
 
-    def mark(law: Judge) -> Judge:
-        fault = Fault(law.__name__, figure, what, full, full if quick is None else quick, changes, nested)
-        vars(law).setdefault("faults", []).insert(0, fault)  # Python applies the last decorator first
-        return law
+    def mark(law: Law) -> Law:
+        fault = Fault(law.name, criterion, what, full, full if quick is None else quick, changes, nested)
+        return replace(law, faults=(fault, *law.faults))  # Python applies the last decorator first
 
     return mark
 
 
-@dataclass(frozen=True)
-class Part(Bound):
-    """A figure that was measured; the note is the reason for its limit, the snippet shows its worst case."""
+def by_name(*laws: Law) -> dict[str, Law]:
+    return {law.name: law for law in laws}
 
-    figure: str = ""  # its name in the law
+
+@dataclass(frozen=True)
+class Measurement:
+    """A criterion as measured; the note is the reason for its limit, the snippet shows its worst case."""
+
+    name: str
+    measured: float
+    limit: float
+    at_most: bool = True  # else: at least
+    note: str = ""
+    criterion: str = ""  # its name in the law
     snippet: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is within the limit; NaN never is."""
+        return self.measured <= self.limit if self.at_most else self.measured >= self.limit
+
+    @property
+    def sign(self) -> str:
+        return "<=" if self.at_most else ">="
 
     def used(self) -> float:
         """The share of its limit that it uses; infinity beyond it."""
         if not self.holds:
             return math.inf
-        over, under = sorted((self.measured, self.limit))
-        return over / under if under > 0 else 0.0
+        under, over = sorted((self.measured, self.limit))
+        return under / over if over > 0 else 0.0
 
 
 @dataclass
-class Law:
-    """One law: its figures, or why it was skipped. ``measured``, ``limit``, ``why`` are of the worst one."""
+class Outcome:
+    """What was found of one law, or why it was skipped.
 
-    name: str
-    parts: list[Part] = field(default_factory=list)
+    ``measured``, ``limit``, ``why`` and ``snippet`` are those of the worst criterion.
+    """
+
+    law: Law
+    parts: list[Measurement] = field(default_factory=list)
     skipped: str = ""
     notes: list[str] = field(default_factory=list)
-    figures: Mapping[str, Figure] = field(default_factory=dict)
     program: Callable[..., str] | None = None  # writes snippets, while the law is checked
+    output: str = ""  # what the snippet of the worst criterion prints, where the law fails
+    plot: Callable[[], Any] | None = None  # makes a figure of matplotlib that shows the failure
 
-    def hold(
+    def check(
         self,
         name: str,
         measured: ArrayLike,
-        at: Lanes = NOWHERE,
+        at: Lanes = NO_LANES,
         *,
         where: ArrayLike = True,
         limit: float | None = None,
         **names: Any,
     ) -> None:
-        """Hold a figure, a number or N errors, to its limit.
+        """Compare a number, or N errors, with the limit of a criterion.
 
         ``at`` and ``names`` fill its words and its snippet: values, or arrays that have a row for each error.
-        ``where``: which errors count. A quantile of fewer than ``FEWEST`` says nothing, and is left out.
+        ``where``: which errors are judged. A share of none, and a quantile of fewer than
+        ``MIN_QUANTILE_ERRORS``, are not judged.
         """
-        figure = self.figures[name]
-        statistic = STATISTICS.get(figure.statistic)
-        errors = np.where(where, np.asarray(measured, np.float64), 0 if statistic else np.nan)
+        criterion = self.law.criteria[name]
+        statistic = STATISTICS.get(criterion.statistic)
+        errors = np.asarray(measured, np.float64)
+        judged = np.broadcast_to(where, errors.shape)
+        errors = np.where(judged, errors, 0 if statistic else np.nan)
         worst = np.where(np.isnan(errors), np.inf, errors).argmax()
         if statistic:
             amount = statistic(errors)
-        elif np.count_nonzero(~np.isnan(errors)) < FEWEST:
+        elif np.count_nonzero(~np.isnan(errors)) < MIN_QUANTILE_ERRORS:
             return
         else:
-            amount = np.nanquantile(errors, float(figure.statistic))
+            amount = np.nanquantile(errors, float(criterion.statistic))
             worst = np.nanargmin(abs(errors - amount))
+        if criterion.statistic == "share":
+            if not judged.any():
+                return
+            amount /= np.count_nonzero(judged)
         names = vars(at) | names
         if errors.ndim:
             names = {key: x[worst] if isinstance(x, np.ndarray) else x for key, x in names.items()}
-        snippet = ""
-        if self.program and figure.snippet:
-            snippet = self.program(figure.snippet, **names)
-        part = Part(
-            name=figure.what.format(**names),
-            measured=float(amount),
-            limit=float(figure.limit if limit is None else limit),
-            at_most=figure.statistic != "at least",
-            note=figure.why,
-            figure=name,
-            snippet=snippet,
+        self.parts.append(
+            Measurement(
+                name=criterion.what.format(**names),
+                measured=float(amount),
+                limit=float(criterion.limit if limit is None else limit),
+                at_most=criterion.statistic != "at least",
+                note=criterion.why,
+                criterion=name,
+                snippet=self.program(criterion.snippet, **names)
+                if self.program and criterion.snippet
+                else "",
+            )
         )
-        self.parts.append(part)
+
+    def fail(self, what: str, why: str, limit: float = 0) -> None:
+        """Fail for a reason that is no criterion's."""
+        self.parts.append(Measurement(what, math.inf, limit, note=why))
+
+    def skip(self, reason: str) -> None:
+        """Stop here. What was measured before counts; where nothing was, the law is skipped."""
+        if self.parts:
+            self.notes.append(reason)
+        else:
+            self.skipped = reason
 
     @property
-    def worst(self) -> Part:
-        """The figure that uses most of its limit."""
-        return max(self.parts, key=Part.used, default=Part("", math.nan, math.nan))
+    def name(self) -> str:
+        return self.law.name
+
+    @property
+    def worst(self) -> Measurement:
+        """The criterion that uses most of its limit."""
+        return max(self.parts, key=Measurement.used, default=Measurement("", math.nan, math.nan))
 
     @property
     def measured(self) -> float:
@@ -206,34 +270,22 @@ class Law:
 
     @property
     def holds(self) -> bool:
-        """Whether every figure is within its limit; a skipped law does not fail."""
-        if self.skipped:
-            return True
-        return bool(self.parts) and all(part.holds for part in self.parts)
+        """Whether every criterion is within its limit; a skipped law does not fail."""
+        return all(part.holds for part in self.parts) and bool(self.parts or self.skipped)
 
     @property
     def note(self) -> str:
-        """The worst figure in words, and remarks."""
+        """The worst criterion in words, and remarks."""
         return "; ".join(filter(None, [self.worst.name, *self.notes]))
 
     @property
     def verdict(self) -> str:
-        if self.skipped:
-            return "skipped"
-        return "holds" if self.holds else "FAILS"
+        if not self.holds:
+            return "FAILS"
+        return "holds" if self.parts else "skipped"
 
     def __str__(self) -> str:
         text = self.skipped
-        if not text:
+        if self.parts:
             text = f"{self.measured:.4g} {self.worst.sign} {self.limit:.4g}, {self.note}"
         return f"{self.verdict:<7} {self.name}: {text}"
-
-
-def laws_in(*modules: ModuleType) -> dict[str, Judge]:
-    """The laws that modules define, by name."""
-    functions = [x for module in modules for x in vars(module).values() if isinstance(x, FunctionType)]
-    return {law.__name__: law for law in functions if "figures" in vars(law)}
-
-
-def faults_of(laws: Iterable[Judge]) -> list[Fault]:
-    return [fault for law in laws for fault in vars(law).get("faults", ())]

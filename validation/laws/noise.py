@@ -13,17 +13,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mrt_mitsuba.validation.laws.probe import Array, Function, Lanes
+from .probe import Array, Function, Lanes
 
 ROUNDING = 2.0**-24
 ALLOWANCE = 8.0  # roundings that a formula of some dozen operations may make of its own
-LOST = 2.5  # sound formulas stay below 1.6
-STEEP = 0.05
+MAX_NOISE = 2.5  # sound formulas stay below 1.6
+MAX_RELATIVE_CHANGE = 0.05
 POINTS = 9  # of each line; Moré and Wild find seven to nine enough
-STRIDES = (2, 64, 2**11, 2**15)  # the most float32 steps from one to the next
-COARSE = (2**13, 2**15, 2**17, 2**19)  # the same for stairs on a slope
-TABLES = 1000.0  # roundings: linear interpolation in a table of 64 entries leaves up to 150
-ALIKE = 3  # a kink's noise is four times as large at four times the step
+STRIDES = (2, 64)  # the most float32 steps from one to the next
+COARSE = (2**8, 2**10, 2**12)  # the same for stairs on a slope; steps of a table are further apart
+MIN_STAIRS = 300.0  # roundings: linear interpolation in a table of 64 entries leaves up to 150
+MAX_NOISE_RATIO = 3  # a kink's noise is four times as large at four times the step
 REACHES = tuple(2**k for k in (2, 5, 8, 11, 13))  # float32 steps to either side, for the slope
 
 
@@ -32,7 +32,8 @@ def ecnoise(lines: Array, *, coarse: bool = False) -> Array:
 
     The first order k counts from which on three estimates agree to a factor of four and whose differences
     have both signs. If none is so, it is the smallest of all; or NaN where the line is too long to tell, for
-    the values change along it by more than ``STEEP`` of the largest; and NaN wherever they change by half.
+    the values change along it by more than ``MAX_RELATIVE_CHANGE`` of the largest; and NaN wherever they
+    change by half.
     ``coarse``: the least of all orders from the third, and 0 where values change by half.
     """
     table = np.float64(lines)
@@ -48,7 +49,7 @@ def ecnoise(lines: Array, *, coarse: bool = False) -> Array:
     change = np.ptp(lines, axis=0) / abs(lines).max(axis=0)
     if coarse:
         return np.where(change > 0.5, 0, level[2:].min(axis=0))
-    noise = np.where(change > STEEP, np.nan, level[:-2].min(axis=0))
+    noise = np.where(change > MAX_RELATIVE_CHANGE, np.nan, level[:-2].min(axis=0))
     for k in reversed(range(len(level) - 2)):
         three = level[k : k + 3]
         agree = three.max(axis=0) <= 4 * three.min(axis=0)
@@ -83,7 +84,8 @@ def measure(
     value changes at half of them, since lost digits leave stairs, flat where a line is short. ``project``
     makes inputs far from the first valid again; with it, ``COARSE`` lines are examined as well. Stairs are as
     high at any step that is large compared with them, unlike kinks and what is left of a smooth function:
-    only noise that is ``ALIKE`` at two steps counts.
+    only noise whose ratio at two steps is at most ``MAX_NOISE_RATIO`` counts. Nine in ten lines are shorter
+    than a step of a table that is read by the nearest of a thousand entries: that is no rounding error.
     """
     inputs = np.float32(inputs)
     rng = np.random.default_rng(seed)
@@ -111,7 +113,7 @@ def measure(
         stairs = np.array([ecnoise(line, coarse=True) for line in values(along(COARSE), project)])
         small = np.minimum(stairs[:-1], stairs[1:])
         large = np.maximum(stairs[:-1], stairs[1:])
-        alike = (large <= ALIKE * small) & (small > TABLES * unit)
+        alike = (large <= MAX_NOISE_RATIO * small) & (small > MIN_STAIRS * unit)
         both = np.where(alike, small, 0).max(axis=0)
         noise = np.where(np.nan_to_num(noise) < both, both, noise)
     lost = np.nan_to_num(noise / unit / np.hypot(2 * explained / unit, ALLOWANCE), posinf=0)

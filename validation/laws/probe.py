@@ -1,4 +1,4 @@
-"""Plugins asked in bulk: directions and samples as numpy arrays, whatever the variant."""
+"""Plugins called in bulk: directions and samples as numpy arrays, whatever the variant."""
 
 from __future__ import annotations
 
@@ -10,14 +10,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.plugins.whitted.tables import aligned
-
 Array = np.ndarray
 ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
 BEYOND = "relative, beyond 8 times what the rounding of directions explains"  # as ``excess`` has it
 Part = TypeVar("Part", bound="Lanes")
 Function = Callable[[Array], Array]
 Call = Callable[..., Any]  # its values are a Dr.Jit array, or several
+
+
+# What methods return that Mitsuba calls while it renders
+RETURNS = {
+    "eval": ("Spectrum",),
+    "pdf": ("Float",),
+    "eval_pdf": ("Spectrum", "Float"),
+    "sample": ("BSDFSample3f", "Spectrum"),
+    "eval_null_transmission": ("Spectrum",),
+    "sample_direction": ("DirectionSample3f", "Spectrum"),
+    "pdf_direction": ("Float",),
+    "eval_direction": ("Spectrum",),
+}
 
 
 class Lanes(SimpleNamespace):
@@ -40,7 +51,7 @@ def joined(parts: Sequence[Part]) -> Part:
 
 
 def named(names: str, columns: Sequence[Array]) -> Lanes:
-    """Columns under names, which spaces part."""
+    """Lanes from columns and their space-separated names."""
     return Lanes(**dict(zip(names.split(), columns, strict=True)))
 
 
@@ -90,8 +101,35 @@ def at_wavelengths(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     return si
 
 
+def _fits(value: Any, kind: str) -> bool:
+    """Whether Mitsuba takes a value for a type of the current variant."""
+    if kind == "Spectrum":
+        return bool(dr.is_arithmetic_v(value)) and not isinstance(value, bool)
+    if kind == "Float":
+        return bool(dr.is_arithmetic_v(value)) and dr.depth_v(value) <= dr.depth_v(mi.Float)
+    return isinstance(value, getattr(mi, kind))
+
+
+def method(plugin: mi.Object, name: str) -> Call:
+    """A method of a plugin as Mitsuba calls it: with ``active``, and of certain types.
+
+    It raises ``TypeError`` where the plugin returns another type.
+    """
+
+    def call(*given: Any) -> Any:
+        answer = getattr(plugin, name)(*given, mi.Bool(True))
+        kinds = RETURNS[name]
+        parts = answer if isinstance(answer, tuple | list) else (answer,)
+        if len(parts) != len(kinds) or not all(map(_fits, parts, kinds)):
+            what = ", ".join(type(part).__name__ for part in parts)
+            raise TypeError(f"{name}() returned {what}: it must return {', '.join(kinds)}")
+        return answer
+
+    return call
+
+
 class Probe:
-    """Asks one BSDF about lanes: ``wi`` and ``wo`` [N, 3] in its frame, ``uv`` [N, 2], ``u`` [N, 3].
+    """Calls one BSDF for lanes: ``wi`` and ``wo`` [N, 3] in its frame, ``uv`` [N, 2], ``u`` [N, 3].
 
     ``wi`` and ``uv`` may also be the same for all lanes: [3] and [2].
     """
@@ -113,23 +151,26 @@ class Probe:
 
     def eval(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> Array:
         """f |cos θo|. [N, channels]"""
-        return self.ask(self.plugin.eval, at, ctx)[0]
+        return self.ask(method(self.plugin, "eval"), at, ctx)[0]
 
     def pdf(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> Array:
         """The density per solid angle. [N]"""
-        return self.ask(self.plugin.pdf, at, ctx)[0]
+        return self.ask(method(self.plugin, "pdf"), at, ctx)[0]
 
     def both(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> list[Array]:
         """``eval`` and ``pdf``, each by itself."""
 
-        def values(*asked: Any) -> list[mi.Spectrum]:
-            return [self.plugin.eval(*asked), self.plugin.pdf(*asked)]
+        value = method(self.plugin, "eval")
+        density = method(self.plugin, "pdf")
+
+        def values(*given: Any) -> list[mi.Spectrum]:
+            return [value(*given), density(*given)]
 
         return self.ask(values, at, ctx)
 
     def pair(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> list[Array]:
         """The two of ``eval_pdf``."""
-        return self.ask(self.plugin.eval_pdf, at, ctx)
+        return self.ask(method(self.plugin, "eval_pdf"), at, ctx)
 
     def sample(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> Lanes:
         """The lanes with a sample each: ``wo`` [N, 3], ``weight`` [N, channels], the others [N].
@@ -139,8 +180,10 @@ class Probe:
         become 0.
         """
 
+        sample = method(self.plugin, "sample")
+
         def call(c: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Vector3f) -> Sequence[Any]:
-            bs, weight = self.plugin.sample(c, si, u.x, mi.Point2f(u.y, u.z))
+            bs, weight = sample(c, si, u.x, mi.Point2f(u.y, u.z))
             return [bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, weight]
 
         wo, pdf, eta, flags, lobe, weight = self.ask(call, at, ctx, "u")
@@ -215,7 +258,16 @@ def as_mitsuba(kind: str, column: Array) -> Any:
     Dr.Jit compiles a kernel for every number of rows of a matrix, and for every alignment of memory.
     """
     rows = np.atleast_2d(column.T)
-    return getattr(mi, kind)(*(aligned(row) for row in rows))
+    return getattr(mi, kind)(*map(_aligned, rows))
+
+
+def _aligned(row: Array) -> mi.Float:
+    """Numbers as a flat array, at a multiple of 64 bytes."""
+    room: Array = np.empty(len(row) + 16, np.float32)
+    start = -room.ctypes.data % 64 // 4
+    place = room[start : start + len(row)]
+    place[:] = row
+    return mi.Float(place)
 
 
 def unit(v: Array) -> Array:

@@ -3,36 +3,40 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from html import escape
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba import runtime
-from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.scene.open import Source, open_scene
-from mrt_mitsuba.validation.laws.bsdf import check_bsdf
-from mrt_mitsuba.validation.laws.emitter import check_emitter
-from mrt_mitsuba.validation.laws.examine import Check
-from mrt_mitsuba.validation.laws.probe import not_finite
-from mrt_mitsuba.validation.laws.shape import check_shape
-from mrt_mitsuba.validation.laws.subject import class_name
-from mrt_mitsuba.validation.page import save_report
-from mrt_mitsuba.validation.study import Study
+from . import page
+from .bsdf import check_bsdf
+from .case import class_name
+from .emitter import check_emitter
+from .examine import Check
+from .probe import not_finite
+from .shape import check_shape
 
-ALIKE = 6  # of one kind of plugin, so many are checked, spread over all
-DEPTH = 12  # bounces that the hunt follows
+Plugin = tuple[str, int, mi.Object]  # its kind, and its number among those of the kind
+MAX_PER_KIND = 6  # plugins of one kind that are checked, spread over all
+MAX_BOUNCES = 12  # bounces that the hunt follows
 COUNTS = (16, 128, 1024, 8192)  # samples of one pixel, to see a fault again
 
 
 @dataclass(frozen=True)
-class Fault:
+class Shot:
+    """What is rendered to look for pixels that are not finite."""
+
+    scene: mi.Scene
+    integrator: mi.Integrator
+    sensor: mi.Sensor
+
+
+@dataclass(frozen=True)
+class PixelFault:
     """A pixel that is not finite: the smallest crop found that shows it, and what makes it."""
 
     pixels: int  # how many there are in the whole picture
@@ -54,7 +58,7 @@ class SceneCheck:
 
     name: str
     checks: Mapping[str, Check]
-    fault: Fault | None
+    fault: PixelFault | None
     left_out: tuple[str, ...] = ()
 
     @property
@@ -73,52 +77,54 @@ class SceneCheck:
         return "\n".join([*lines, f"{self.name}: {'passed' if self.passed else 'FAILED'}"])
 
     def save(self, folder: str | Path) -> None:
-        """Write the page (``index.html``), ``summary.json`` and CSV files. Raises ``OutputError``."""
-        picture = Study("picture", "picture")
-        bad = self.fault.pixels if self.fault else 0
-        picture.at_most("pixels that are not finite", bad, 0, str(self.fault or "a picture is of numbers"))
-        studies = [*(check.study() for check in self.checks.values()), picture]
-        save_report(folder, *studies, title=f"Laws of plugins: {self.name}")
+        """Write a page (``index.html``), ``summary.json`` and ``laws.csv``. Raises ``OSError``."""
+        page.write(folder, page.files(self.checks, f"Laws of plugins: {self.name}", self._remarks()))
 
     def _repr_html_(self) -> str:
-        return f"<pre>{escape(str(self))}</pre>"
+        return page.frame(self.checks, f"Laws of plugins: {self.name}", self._remarks())
+
+    def _remarks(self) -> list[str]:
+        return [str(self.fault or "every pixel is finite"), *self.left_out]
 
 
 def check_scene(
-    scene: Any, *, quick: bool = False, seed: int = 0, progress: Progress | None = None, **options: Any
+    scene: mi.Scene,
+    *,
+    integrator: mi.Integrator | None = None,
+    sensor: mi.Sensor | None = None,
+    name: str = "scene",
+    quick: bool = False,
+    seed: int = 0,
+    progress: Callable[[Sequence[Plugin]], Iterable[Plugin]] = iter,
 ) -> SceneCheck:
-    """Check every BSDF, shape and emitter of a scene, and hunt for pixels that are not finite.
+    """Check every BSDF, shape and emitter of a loaded scene, and look for pixels that are not finite.
 
-    ``scene`` and ``options`` (such as ``integrator``) are those of ``render``. Only some
-    of many plugins of one kind are checked. Raises ``SceneError`` or ``UsageError`` where the scene does not
-    open.
+    ``integrator`` and ``sensor`` default to the scene's own. Only some of many plugins of one kind are
+    checked. ``progress`` iterates over them, as ``tqdm.tqdm`` does.
     """
-    runtime.use()
-    source = open_scene(scene, **options)
-    kinds = _plugins(source.scene)
-    lights = partial(check_emitter, scene=source.scene)
+    kinds = _plugins(scene)
+    lights = partial(check_emitter, scene=scene)
     check_of: dict[str, Callable[..., Check]]
     check_of = {"BSDF": check_bsdf, "shape": check_shape, "emitter": lights}
-    checks = {}
+    chosen = []
     left_out = []
-    chosen = {kind: range(0, len(alike), max(len(alike) // ALIKE, 1)) for kind, alike in kinds.items()}
-    with (progress or Progress()).stage("Laws", sum(map(len, chosen.values()))) as advance:
-        for kind, alike in kinds.items():
-            for number in chosen[kind]:
-                plugin = alike[number]
-                name = f"{kind} {plugin.id() or number}"
-                if name in checks:
-                    name = f"{name} ({number})"
-                check = check_of[kind.split()[0]](plugin, quick=quick, seed=seed)
-                checks[name] = replace(check, subject=name)
-                advance(1)
-            more = len(alike) - len(chosen[kind])
-            if more:
-                left_out.append(f"{more} more of {kind} are like those that were checked")
-    instances = sum(shape.class_name() == "Instance" for shape in source.scene.shapes())
+    for kind, alike in kinds.items():
+        some = range(0, len(alike), max(len(alike) // MAX_PER_KIND, 1))
+        chosen += [(kind, number, alike[number]) for number in some]
+        if len(alike) > len(some):
+            left_out.append(f"{len(alike) - len(some)} more of {kind} are like those that were checked")
+    checks: dict[str, Check] = {}
+    for kind, number, plugin in progress(chosen):
+        title = f"{kind} {plugin.id() or number}"
+        if title in checks:
+            title = f"{title} ({number})"
+        check = check_of[kind.split()[0]](plugin, quick=quick, seed=seed)
+        checks[title] = replace(check, subject=title)
+    instances = sum(shape.class_name() == "Instance" for shape in scene.shapes())
     if instances:
         left_out.append(f"{instances} instances are not checked: give a dict of one with its group")
-    return SceneCheck(source.name, checks, _hunt(source, quick, seed), tuple(left_out))
+    shot = Shot(scene, integrator or scene.integrator(), sensor or scene.sensors()[0])
+    return SceneCheck(name, checks, _hunt(shot, quick, seed), tuple(left_out))
 
 
 def _plugins(scene: mi.Scene) -> dict[str, list[mi.Object]]:
@@ -135,57 +141,57 @@ def _plugins(scene: mi.Scene) -> dict[str, list[mi.Object]]:
 # ------------------------------------------------- The hunt -----------------------------------------------
 
 
-def _hunt(source: Source, quick: bool, seed: int) -> Fault | None:
+def _hunt(shot: Shot, quick: bool, seed: int) -> PixelFault | None:
     """Render, and look for a pixel that is not finite: alone if it then still is, else in the whole film."""
     spp = 4 if quick else 32
-    bad = _bad(source, spp, seed)
+    bad = _bad(shot, spp, seed)
     if not bad.any():
         return None
-    left, top = source.sensor.film().crop_offset()
+    left, top = shot.sensor.film().crop_offset()
     y, x = np.argwhere(bad)[0]
     alone = int(left + x), int(top + y), 1, 1
-    params = mi.traverse(source.sensor)
+    params = mi.traverse(shot.sensor)
     crop = {"film.crop_size": alone[2:], "film.crop_offset": alone[:2]}
     before = {key: type(params[key])(params[key]) for key in crop}
     params.update(crop)
     try:
         for count in COUNTS:
-            if _bad(source, count, seed).any():
-                return Fault(bad.sum(), alone, count, _culprit(source, count, seed))
+            if _bad(shot, count, seed).any():
+                return PixelFault(bad.sum(), alone, count, _culprit(shot, count, seed))
     finally:
         params.update(before)
     whole = int(left), int(top), *bad.shape[::-1]
-    return Fault(bad.sum(), whole, spp, _culprit(source, spp, seed))
+    return PixelFault(bad.sum(), whole, spp, _culprit(shot, spp, seed))
 
 
-def _bad(source: Source, spp: int, seed: int) -> np.ndarray:
+def _bad(shot: Shot, spp: int, seed: int) -> np.ndarray:
     """Which pixels are not finite. [H, W]"""
-    picture = mi.render(source.scene, integrator=source.integrator, sensor=source.sensor, spp=spp, seed=seed)
+    picture = mi.render(shot.scene, integrator=shot.integrator, sensor=shot.sensor, spp=spp, seed=seed)
     return ~np.isfinite(np.array(picture)).all(axis=-1)
 
 
-def _culprit(source: Source, spp: int, seed: int) -> str:
+def _culprit(shot: Shot, spp: int, seed: int) -> str:
     """Follow paths through the crop, and name the object whose own numbers are first not finite."""
     if mi.variant().startswith("scalar"):
         return "something that scalar variants do not reveal: check it in a vectorised one"
-    pixels = int(np.prod(np.array(source.sensor.film().crop_size())))
+    pixels = int(np.prod(np.array(shot.sensor.film().crop_size())))
     for attempt in range(8):
-        counts = _follow(source, min(max(spp, 2**12) * pixels, 2**20), seed + attempt)
+        counts = _follow(shot, min(max(spp, 2**12) * pixels, 2**20), seed + attempt)
         if counts:
             return counts.most_common(1)[0][0]
     return "no object's own numbers: by the integrator, or a sum that overflows"
 
 
-def _follow(source: Source, count: int, seed: int) -> Counter[str]:
+def _follow(shot: Shot, count: int, seed: int) -> Counter[str]:
     """How often each object was the first to give an infinity or NaN, in one batch of paths."""
-    scene = source.scene
+    scene = shot.scene
     ctx = mi.BSDFContext()
     counts: Counter[str] = Counter()
     active = mi.Bool(True)
     rng = mi.PCG32(count, initstate=seed)
     draw = rng.next_float32
     # the unit square covers the crop of a cropped film
-    ray, _ = source.sensor.sample_ray(draw(), draw(), mi.Point2f(draw(), draw()), mi.Point2f(draw(), draw()))
+    ray, _ = shot.sensor.sample_ray(draw(), draw(), mi.Point2f(draw(), draw()), mi.Point2f(draw(), draw()))
 
     def sound(what: str, pointers: mi.Object, *values: mi.Float | mi.Spectrum) -> mi.Mask:
         """Where values are finite; those that are not are counted for the objects of ``pointers``."""
@@ -198,7 +204,7 @@ def _follow(source: Source, count: int, seed: int) -> Counter[str]:
             counts[f"the {what} {name}"] += int(dr.count(bad & here)[0])
         return ~bad
 
-    for _ in range(DEPTH):
+    for _ in range(MAX_BOUNCES):
         si = scene.ray_intersect(ray, active)
         met = si.emitter(scene, active)
         active &= sound("emitter", met, met.eval(si, active))

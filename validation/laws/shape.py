@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mrt_mitsuba.validation.laws import shape_hits, shape_samples
-from mrt_mitsuba.validation.laws.examine import TIMEOUT, Check, examine
-from mrt_mitsuba.validation.laws.law import laws_in
-from mrt_mitsuba.validation.laws.shape_case import Case
-from mrt_mitsuba.validation.laws.subject import Given
+from . import shape_hits, shape_samples
+from .case import Given
+from .examine import TIMEOUT, Check, examine
+from .law import by_name
+from .shape_case import ShapeCase
 
-LAWS = laws_in(shape_hits, shape_samples)
+LAWS = by_name(
+    shape_hits.hits,
+    shape_hits.surface,
+    shape_hits.normals,
+    shape_hits.watertight,
+    shape_hits.scale,
+    shape_hits.far,
+    shape_hits.finite,
+    shape_hits.bbox,
+    shape_hits.variants,
+    shape_samples.sampling,
+)
 
 
 def check_shape(
@@ -25,6 +36,6 @@ def check_shape(
 
     Any other object that has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well.
     ``quick``: fewer rays. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law fails that is
-    not done. Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
+    not done. Raises ``UsageError`` for anything else, and ``LoadError`` for a dict that Mitsuba cannot load.
     """
-    return examine(Case, shape, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
+    return examine(ShapeCase, shape, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)

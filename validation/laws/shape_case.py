@@ -1,4 +1,4 @@
-"""A shape under examination, rays towards it and what they meet."""
+"""A shape under test, rays towards it and what they meet."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.linalg import norm
 
-from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.validation.laws import subject
-from mrt_mitsuba.validation.laws.law import FEWEST, Skip
-from mrt_mitsuba.validation.laws.noise import ROUNDING
-from mrt_mitsuba.validation.laws.probe import (
+from .case import Case, Given, class_name
+from .law import MIN_QUANTILE_ERRORS, Skip, UsageError
+from .noise import ROUNDING
+from .probe import (
     Array,
     Lanes,
     corners,
@@ -21,7 +20,6 @@ from mrt_mitsuba.validation.laws.probe import (
     named,
     unit,
 )
-from mrt_mitsuba.validation.laws.subject import Given, Subject
 
 OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
 FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
@@ -29,6 +27,7 @@ MOST_HITS = 16  # along a line
 HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
 TYPICAL = 16  # roundings: twice the most that was measured of sound shapes
 FAR = 1e4  # sizes away
+UNSCALED = ("BSplineCurve", "LinearCurve", "Ellipsoids", "EllipsoidsMesh")  # to_world leaves their radii
 SMOOTHED = ("SDFGrid", "BSplineCurve", "LinearCurve", "Instance")
 
 RAY = """si = scene.ray_intersect(mi.Ray3f(o, d))
@@ -77,8 +76,42 @@ def walk(target: mi.Scene, hits: Lanes) -> Iterator[tuple[Array, Lanes]]:
         hits = trace(target, leave(hits, hits.d), hits.d)
 
 
-class Case(Subject):
-    """A shape under examination, rays towards it and what they meet."""
+def alone(shape: mi.Shape) -> mi.Scene:
+    """A scene with one shape, which keeps its id."""
+    name = shape.id()
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    shape.set_id(name)
+    return scene
+
+
+# a sphere around a box, from 1.5 times its diagonal away: the sine of its half angle is a third
+COSINE = float(np.sqrt(1 - 1 / 9))
+CONE = 2 * np.pi * (1 - COSINE)  # its solid angle
+
+
+class View:
+    """Points all around a box [2, 3], and the cones from them that hold it."""
+
+    def __init__(self, box: Array) -> None:
+        self.middle = box.mean(axis=0)
+        self.size = float(norm(box[1] - box[0]))
+
+    def around(self, case: Case, count: int) -> Array:
+        """Points that look at the box, from 1.5 sizes away. [count, 3]"""
+        return np.float32(self.middle + 1.5 * self.size * case.units(count))
+
+    def into_cone(self, o: Array, rng: np.random.Generator) -> Array:
+        """Uniform directions from points [N, 3] into the cone that holds the box. [N, 3]"""
+
+        def direction(axis: mi.Vector3f, u: mi.Point2f) -> mi.Vector3f:
+            return mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(u, COSINE))
+
+        u = rng.random((len(o), 2), np.float32)
+        return lanes(direction, ("Vector3f", unit(self.middle - o)), ("Point2f", u))[0]
+
+
+class ShapeCase(Case):
+    """A shape under test, rays towards it and what they meet."""
 
     word = "shape"
 
@@ -88,14 +121,12 @@ class Case(Subject):
             kind = type(self.plugin).__name__
             raise UsageError(f"{kind} is not a shape of {mi.variant()}: give a dict or a loaded shape")
         self.target = self.plugin
-        if subject.class_name(self.plugin) == "Instance":
+        if class_name(self.plugin) == "Instance":
             if self.description is None:
                 raise UsageError("a loaded instance does not give its group away: give a dict of both")
             self.target = self.scene()
         elif isinstance(self.plugin, mi.Shape):
-            name = self.plugin.id()
-            self.target = mi.load_dict({"type": "scene", "shape": self.plugin})
-            self.plugin.set_id(name)  # which the scene has changed
+            self.target = alone(self.plugin)
         self.box = corners(self.plugin)
         if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
             raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
@@ -109,13 +140,14 @@ class Case(Subject):
             self.points = np.concatenate([self.box, vertex, middles.reshape(-1, 3)])
         self.low = self.points.min(axis=0)  # the box itself may be wrong
         self.high = self.points.max(axis=0)
-        self.middle = (self.low + self.high) / 2
-        self.size = float(norm(self.high - self.low))
+        self.view = View(np.array([self.low, self.high]))
+        self.middle = self.view.middle
+        self.size = self.view.size
         self.extent = np.maximum(self.high - self.low, 0.01 * self.size)
 
     def around(self, count: int) -> Array:
-        """Points that look at the shape, from 1.5 sizes away. [count, 3]"""
-        return np.float32(self.middle + 1.5 * self.size * self.units(count))
+        """Points that look at the shape. [count, 3]"""
+        return self.view.around(self, count)
 
     @cached_property
     def seen(self) -> Lanes:
@@ -128,7 +160,7 @@ class Case(Subject):
     def met(self) -> Lanes:
         """The rays that meet the surface and do not graze it, and their hits."""
         steep = self.seen.steep
-        if steep.sum() < FEWEST:
+        if steep.sum() < MIN_QUANTILE_ERRORS:
             raise Skip("hardly any ray towards its bounding box meets the shape")
         return self.seen[steep]
 
@@ -162,7 +194,7 @@ class Case(Subject):
     def closed(self) -> bool:
         """Whether most lines cross the surface an even number of times: it is closed, with holes perhaps."""
         judged, even = self.lines
-        return bool(judged.sum() > FEWEST and even[judged].mean() > 0.75)
+        return bool(judged.sum() > MIN_QUANTILE_ERRORS and even[judged].mean() > 0.75)
 
     @cached_property
     def lines(self) -> tuple[Array, Array]:

@@ -12,22 +12,23 @@ import numpy as np
 from numpy.linalg import norm
 from scipy import stats
 
-from mrt_mitsuba.validation.laws import noise, subject
-from mrt_mitsuba.validation.laws.faults import SIZE, larger, member, off_surface, put, tilted
-from mrt_mitsuba.validation.laws.law import (
-    FEWEST,
-    LEVEL,
-    Figure,
-    Law,
+from . import noise, plots
+from .case import READS, READS_WHY, class_name, judge_many, reads_checked
+from .faults import SIZE, larger, member, off_surface, put, tilted
+from .law import (
+    MIN_QUANTILE_ERRORS,
+    SIGNIFICANCE,
+    Criterion,
+    Outcome,
     Skip,
-    figures,
     finds,
+    measures,
     most,
     number_of,
     share_of,
 )
-from mrt_mitsuba.validation.laws.noise import ROUNDING
-from mrt_mitsuba.validation.laws.probe import (
+from .noise import ROUNDING
+from .probe import (
     Array,
     Lanes,
     corners,
@@ -35,14 +36,15 @@ from mrt_mitsuba.validation.laws.probe import (
     not_finite,
     unit,
 )
-from mrt_mitsuba.validation.laws.shape_case import (
+from .shape_case import (
     FAR,
     FLAT,
     HIT_ROUNDINGS,
     RAY,
     SMOOTHED,
     TYPICAL,
-    Case,
+    UNSCALED,
+    ShapeCase,
     dot,
     leave,
     near,
@@ -67,12 +69,12 @@ def missed_in_share(size, met, ray):
     return met & ~in_share(size, ray)
 
 
-@figures(
+@finds("ray_test", "ray_test() misses in this share of directions", 1e-5, ray_test=missed_in_share)
+@measures(
     ray_test=share_of("share of rays {rays} on which ray_test() is wrong", 0, ONE, MAXT),
     ray_intersect=share_of("share of rays {rays} on which ray_intersect() is wrong", 0, ONE, MAXT),
 )
-@finds("ray_test", "ray_test() misses in this share of directions", 1e-5, ray_test=missed_in_share)
-def hits(law: Law, case: Case) -> None:
+def hits(law: Outcome, case: ShapeCase) -> None:
     """``ray_test`` and ``ray_intersect`` agree, and respect ``maxt``, from outside and from the surface."""
     away = case.units(len(case.met.t))
     leaving = trace(case.target, leave(case.met, away), away)
@@ -82,7 +84,7 @@ def hits(law: Law, case: Case) -> None:
     _answers(law, case, "that leave the surface", leaving, np.inf)
 
 
-def _answers(law: Law, case: Case, rays: str, seen: Lanes, reach: float) -> None:
+def _answers(law: Outcome, case: ShapeCase, rays: str, seen: Lanes, reach: float) -> None:
     """Hold the answers about rays of a length of ``reach`` distances to what they are known to meet."""
     maxt = (seen.t * reach).astype(np.float32)
 
@@ -95,7 +97,7 @@ def _answers(law: Law, case: Case, rays: str, seen: Lanes, reach: float) -> None
     limit = 5e-4 if np.isinf(reach) else 0
     for name, answer in zip(("ray_test", "ray_intersect"), answers, strict=True):
         wrong = answer != (seen.met & (reach > 1))
-        law.hold(name, wrong, seen, where=seen.clear, limit=limit, maxt=maxt, rays=rays)
+        law.check(name, wrong, seen, where=seen.clear, limit=limit, maxt=maxt, rays=rays)
 
 
 def too_far(size, si, ray):
@@ -115,21 +117,25 @@ def close(size, si, ray):
     return (si.t < 0.01) & in_share(size, ray)
 
 
-@figures(
+@finds("on_ray", "hit points off the ray, in sizes", 1e-5, ray_intersect=off_surface)
+@finds("near_by", "hit points off, in sizes", 5e-7, ray_intersect=off_surface)
+@finds("behind", "hits too far away, in sizes", 5e-7, ray_intersect=too_far)
+@finds("missed", "a least distance for this share of directions", 3e-3, ray_intersect=missed(close))
+@measures(
     on_ray=most(
         "hit point off the ray at its distance, in roundings of the largest number",
         HIT_ROUNDINGS,
         "some dozen operations",
         RAY,
     ),
-    near_by=Figure(
+    near_by=Criterion(
         0.5,
         "hit point off a ray of a twentieth of the size, in roundings of the largest coordinate, median",
         TYPICAL,
         "a few operations",
         RAY,
     ),
-    behind=Figure(
+    behind=Criterion(
         0.5,
         "hit points from in front and from behind, across the surface, in roundings of the largest "
         "coordinate, median",
@@ -149,29 +155,25 @@ def close(size, si, ray):
         "no absolute limits; outlines hang on roundings",
         RAY,
     ),
-    noise=Figure(
+    noise=Criterion(
         0.9,
         f"noise of the {{what}} over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10",
-        noise.LOST,
+        noise.MAX_NOISE,
         "digits are lost inside that could be kept",
         RAY,
     ),
 )
-@finds("on_ray", "hit points off the ray, in sizes", 1e-5, ray_intersect=off_surface)
-@finds("near_by", "hit points off, in sizes", 5e-7, ray_intersect=off_surface)
-@finds("behind", "hits too far away, in sizes", 5e-7, ray_intersect=too_far)
-@finds("missed", "a least distance for this share of directions", 3e-3, ray_intersect=missed(close))
-def surface(law: Law, case: Case) -> None:
+def surface(law: Outcome, case: ShapeCase) -> None:
     """Hits lie on the ray and the surface; spawned rays do not meet it where they start; digits are kept."""
     met = case.met
     largest = abs(np.column_stack([met.o, met.p])).max(axis=1) + met.t
-    law.hold("on_ray", _off_ray(met) / (ROUNDING * largest), met)
+    law.check("on_ray", _off_ray(met) / (ROUNDING * largest), met)
     _from_near_by(law, case)
     _again(law, case)
     step = 1e-3 * case.size
     again = trace(case.target, met.p - step * met.d, met.d)
     missed = ~again.met | (norm(again.p - met.p, axis=1) >= step)
-    law.hold("missed", missed, again)
+    law.check("missed", missed, again)
     _noise(law, case)
 
 
@@ -181,7 +183,7 @@ def _off_ray(hits: Lanes) -> Array:
     return abs(along - hits.p).max(axis=1)
 
 
-def _again(law: Law, case: Case) -> None:
+def _again(law: Outcome, case: ShapeCase) -> None:
     """Rays that leave the surface do not meet it where they start."""
     count = case.count(10**5, 10**6)
     few = case.met[case.rng.integers(len(case.met.t), size=count)]
@@ -190,10 +192,10 @@ def _again(law: Law, case: Case) -> None:
     # another part may truly be that near, in a hollow edge
     alike = abs(dot(again.n, few.n)) > np.where(again.part == few.part, 0.9, 0.9999)
     bad = again.met & near(few.p, again.p) & (abs(dot(few.n, away)) > FLAT)
-    law.hold("again", bad, again, where=alike, count=count)
+    law.check("again", bad, again, where=alike, count=count)
 
 
-def _noise(law: Law, case: Case) -> None:
+def _noise(law: Outcome, case: ShapeCase) -> None:
     """The noise of distance, hit point and normal."""
     met = case.few(case.met, 300, 1000)
     scale = abs(met.o).max(axis=1) + met.t
@@ -207,10 +209,10 @@ def _noise(law: Law, case: Case) -> None:
     for which, (what, size) in enumerate(sizes.items()):
         quantity = partial(number, which)
         estimate = noise.measure(quantity, inputs, size=size, strides=(64,), seed=case.seed)
-        law.hold("noise", estimate.lost, met, what=what)
+        law.check("noise", estimate.lost, met, what=what)
 
 
-def _from_near_by(law: Law, case: Case) -> None:
+def _from_near_by(law: Outcome, case: ShapeCase) -> None:
     """From near by, and from the other side, numbers are small, and points that are off show."""
     met = case.few(case.met, 2**12, 2**15)
     d = met.d
@@ -223,10 +225,11 @@ def _from_near_by(law: Law, case: Case) -> None:
     apart = norm(np.float64(back.p) - again.p, axis=1) * abs(dot(met.n, d))
     alike = same & back.met & (back.part == met.part) & (apart < 0.01 * case.size)
     alike &= case.behind.met.mean() > 0.5  # else rays pass it from behind
-    law.hold("near_by", _off_ray(again) / (ROUNDING * largest), again, where=same)
-    law.hold("behind", apart / (ROUNDING * largest), again, where=alike)
+    law.check("near_by", _off_ray(again) / (ROUNDING * largest), again, where=same)
+    law.check("behind", apart / (ROUNDING * largest), again, where=alike)
 
 
+PIXELS = 128  # of a side of a picture of normals
 NEIGHBOUR = """aside = mi.Vector3f({aside})
 si = scene.ray_intersect(mi.Ray3f(o, d))
 near = scene.ray_intersect(mi.Ray3f(o + 1e-3 * {size} * aside, d))
@@ -246,7 +249,13 @@ def inwards(size, si, ray):
     return put(si, n=dr.select(turned, -1, 1) * si.n)
 
 
-@figures(
+@finds("outwards", "normals inwards on this share of most faces", 3e-3, ray_intersect=inwards)
+@finds("length", "normals too long", 3e-5, ray_intersect=member("n", larger))
+@finds("slant", "normals tilted, in radians", 3e-3, ray_intersect=member("n", tilted))
+@finds("slope", "normals tilted as well as derivatives, in radians", 0.03, ray_intersect=member("n", tilted))
+@finds("shading", "shading normals tilted, in radians", 3e-3, ray_intersect=member("sh_frame", tilted_frame))
+@finds("step", "dp_du too long", 0.02, ray_intersect=member("dp_du", larger))
+@measures(
     outwards=share_of(
         "share of rays from outside whose normal points the wrong way",
         1e-3,
@@ -255,7 +264,7 @@ def inwards(size, si, ray):
     ),
     length=most("length of a normal less 1", 1e-5, "a square root and a quotient", RAY),
     side=number_of("shading normals on the other side than the geometric one", 0, "one surface", RAY),
-    shading=Figure(
+    shading=Criterion(
         0.9,
         "shading normal against the geometric one, except on smoothed meshes, 9 in 10",
         2e-3,
@@ -274,47 +283,55 @@ def inwards(size, si, ray):
         "both are known to a few roundings; near a pole the derivatives are short",
         RAY,
     ),
-    slope=Figure(
+    slope=Criterion(
         0.95, "slope of the surface against its normal, by differences, 95 in 100", 1e-2, PARTED, NEIGHBOUR
     ),
-    step=Figure(
+    step=Criterion(
         0.95, "step along the surface less its partial derivatives, 95 in 100", 1e-2, PARTED, NEIGHBOUR
     ),
 )
-@finds("outwards", "normals inwards on this share of most faces", 3e-3, ray_intersect=inwards)
-@finds("length", "normals too long", 3e-5, ray_intersect=member("n", larger))
-@finds("slant", "normals tilted, in radians", 3e-3, ray_intersect=member("n", tilted))
-@finds("slope", "normals tilted as well as derivatives, in radians", 0.03, ray_intersect=member("n", tilted))
-@finds("shading", "shading normals tilted, in radians", 3e-3, ray_intersect=member("sh_frame", tilted_frame))
-@finds("step", "dp_du too long", 0.02, ray_intersect=member("dp_du", larger))
-def normals(law: Law, case: Case) -> None:
+def normals(law: Outcome, case: ShapeCase) -> None:
     """Normals have unit length, point outwards, and agree with partial derivatives and differences."""
     if case.closed:
         judged, even = case.lines
         flipped = isinstance(case.plugin, mi.Shape) and case.plugin.has_flipped_normals()
-        law.hold("outwards", judged & even & ((case.seen.cos > 0) != flipped), case.seen)
+        law.check("outwards", (case.seen.cos > 0) != flipped, case.seen, where=judged & even)
     else:
         law.notes.append("open: there is no outside for normals to point to")
     met = case.met
     length = norm(np.stack([met.n, met.shading]).astype(np.float64), axis=-1)
-    law.hold("length", abs(length - 1).max(axis=0), met)
-    law.hold("side", dot(met.n, met.shading) <= 0, met)
+    law.check("length", abs(length - 1).max(axis=0), met)
+    law.check("side", dot(met.n, met.shading) <= 0, met)
     smoothed = isinstance(case.plugin, mi.Mesh) and case.plugin.has_vertex_normals()
-    if not smoothed and subject.class_name(case.plugin) not in SMOOTHED:
-        law.hold("shading", norm(met.shading - met.n, axis=1), met)
+    if not smoothed and class_name(case.plugin) not in SMOOTHED:
+        law.check("shading", norm(met.shading - met.n, axis=1), met)
     # the normal is the surface's, not the ray's: the same for a ray that comes back from behind
     back = case.behind
     same = back.met & near(met.p, back.p) & (back.part == met.part)
-    if same.sum() > FEWEST:
-        law.hold("turned", dot(back.n, met.n) < -0.5, met, where=same)
+    if same.sum() > MIN_QUANTILE_ERRORS:
+        law.check("turned", dot(back.n, met.n) < -0.5, met, where=same)
     along = unit(np.stack([met.du, met.dv]))  # NaN where the derivative is 0
     slant = abs(dot(along, met.n)).max(axis=0)
     if np.isfinite(slant).any():
-        law.hold("slant", slant, met, where=np.isfinite(slant))
+        law.check("slant", slant, met, where=np.isfinite(slant))
     _differences(law, case)
+    if not law.holds:
+        hits = _picture(case)
+        law.plot = partial(plots.normals, hits.n, hits.shading, hits.met)
 
 
-def _differences(law: Law, case: Case) -> None:
+def _picture(case: ShapeCase) -> Lanes:
+    """The hits of parallel rays from a corner, those of a square picture."""
+    back = np.array([[0.48, 0.36, 0.8]])
+    right = unit(np.cross([[0, 1, 0]], back))
+    up = np.cross(back, right)
+    x, y = np.meshgrid(np.linspace(-0.55, 0.55, PIXELS), np.linspace(0.55, -0.55, PIXELS))
+    offsets = x.reshape(-1, 1) * right + y.reshape(-1, 1) * up
+    o = case.middle + case.size * (offsets + 1.5 * back)
+    return trace(case.target, o, np.tile(-back, (len(o), 1)))
+
+
+def _differences(law: Outcome, case: ShapeCase) -> None:
     """Neighbouring hits against normal and partial derivatives; two widths separate curvature from error."""
     met = case.met
     aside = unit(np.cross(met.d, case.units(len(met.d))))
@@ -332,7 +349,7 @@ def _differences(law: Law, case: Case) -> None:
         ok &= (abs(uv).max(axis=1) < 0.2) & met.du.any()
         partials.append(np.where(ok, off, np.nan))
     for name, (wide, narrow) in (("slope", slopes), ("step", partials)):
-        law.hold(name, np.maximum(2 * narrow - wide, 0), met, aside=aside, size=case.size)
+        law.check(name, np.maximum(2 * narrow - wide, 0), met, aside=aside, size=case.size)
 
 
 def slit(size, si, ray):
@@ -343,7 +360,9 @@ def slit_above(size, si, ray):
     return slit(size, si, ray) & (si.n.z > 0.5)
 
 
-@figures(
+@finds("out", "a slit of this width, in sizes", 3e-5, quick=1e-4, ray_intersect=missed(slit))
+@finds("odd", "a slit of this width in one face, in sizes", 6e-3, ray_intersect=missed(slit_above))
+@measures(
     blind=share_of(
         "share of rays that pass the surface from behind", 1e-2, "it has two sides; edges have room", RAY
     ),
@@ -360,21 +379,18 @@ def slit_above(size, si, ray):
         RAY,
     ),
 )
-@finds("out", "a slit of this width, in sizes", 3e-5, quick=1e-4, ray_intersect=missed(slit))
-@finds("odd", "a slit of this width in one face, in sizes", 6e-3, ray_intersect=missed(slit_above))
-def watertight(law: Law, case: Case) -> None:
+def watertight(law: Outcome, case: ShapeCase) -> None:
     """Lines enter and leave in turn, and no ray escapes from inside."""
     met = case.met
     # else such a ray may fall off an edge, or its offset be larger than the shape
     steep = (abs(met.cos) > 0.5) & (offset(met.p) < 1e-3 * case.size)
-    blind = steep & ~case.behind.met
-    if blind.mean() > 1e-2:
-        law.hold("blind", blind, met)
+    if steep.any() and (~case.behind.met)[steep].mean() > 1e-2:
+        law.check("blind", ~case.behind.met, met, where=steep)
         return
     if not case.closed:
         raise Skip("the shape is open: lines do not leave it as often as they enter")
     judged, even = case.lines
-    law.hold("odd", ~even, case.seen, where=judged, judged=judged.sum())
+    law.check("odd", ~even, case.seen, where=judged, judged=judged.sum())
     inside = _inside(case)
     if not len(inside):
         law.notes.append("no room inside to start rays in")
@@ -382,11 +398,11 @@ def watertight(law: Law, case: Case) -> None:
     count = case.count(10**5, 10**6)
     hits = trace(case.target, case.rng.choice(inside, count), case.units(count))
     out = stats.binomtest(count - hits.met.sum(), count)
-    surely = out.proportion_ci(1 - 2 * LEVEL).low  # Clopper and Pearson
-    law.hold("out", surely, hits[hits.met.argmin()], count=count)
+    surely = out.proportion_ci(1 - 2 * SIGNIFICANCE).low  # Clopper and Pearson
+    law.check("out", surely, hits[hits.met.argmin()], count=count)
 
 
-def _inside(case: Case) -> Array:
+def _inside(case: ShapeCase) -> Array:
     """Points well inside: the middles of the longer first chords of lines. [N, 3]"""
     if len(case.crossings) < 2:
         return np.zeros((0, 3))
@@ -403,7 +419,18 @@ print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}
 """
 
 
-@figures(
+SCALED_BOX = """box = load(to_world=mi.ScalarTransform4f({matrix})).bbox()
+print("as it is:", shape.bbox(), "scaled by 2^{power}:", box)
+"""
+
+
+@measures(
+    box=most(
+        "diagonal of the bounding box at 2^{power} of the size, relative",
+        1e-3,
+        "to_world applies to all of it",
+        SCALED_BOX,
+    ),
     answer=number_of(
         "rays answered otherwise at 2^{power} of the size",
         0,
@@ -417,7 +444,7 @@ print("scaled, t over the scale:", scene.ray_intersect(mi.Ray3f(o * 2.0**{power}
         SCALED,
     ),
 )
-def scale(law: Law, case: Case) -> None:
+def scale(law: Outcome, case: ShapeCase) -> None:
     """At a millionth and a million times the size, hits are the same, scaled; powers of two round nothing."""
     matrix = getattr(case.with_().get("to_world"), "values", np.eye(4))
     seen = case.few(case.seen, 2**12, 2**14)
@@ -429,13 +456,14 @@ def scale(law: Law, case: Case) -> None:
         except RuntimeError as problem:
             raise Skip("to_world is not accepted") from problem
         grown = norm(high - low)
-        if not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
+        if class_name(case.plugin) in UNSCALED and not np.isclose(grown, 2.0**power * case.size, rtol=1e-3):
             raise Skip("to_world does not scale all of it (of curves, the radius stays)")
+        law.check("box", abs(grown / 2.0**power / case.size - 1), power=power, matrix=larger.tolist())
         there = trace(case.scene(to_world=to_world), seen.o * 2.0**power, seen.d)
         error = np.maximum(abs(there.t / 2.0**power / seen.t - 1), 1 - dot(there.n, seen.n))
         both = seen.steep & there.met
         for name, errors, judged in (("answer", there.met != seen.met, seen.clear), ("off", error, both)):
-            law.hold(name, errors, seen, where=judged, power=power, matrix=larger.tolist())
+            law.check(name, errors, seen, where=judged, power=power, matrix=larger.tolist())
 
 
 TWICE = """for o in (o, mi.Point3f({other})):
@@ -452,7 +480,9 @@ def afar(size, si, ray):
     return (si.t > 1000) & in_share(size, ray)
 
 
-@figures(
+@finds("missed", "hits off by this part of a distance above a thousand", 1e-5, ray_intersect=off_from_afar)
+@finds("missed", "misses from afar in this share of directions", 3e-3, ray_intersect=missed(afar))
+@measures(
     missed=share_of(
         "share of rays from afar that miss what is met from nearby, or meet it "
         f"{HIT_ROUNDINGS} roundings off",
@@ -461,9 +491,7 @@ def afar(size, si, ray):
         TWICE,
     ),
 )
-@finds("missed", "hits off by this part of a distance above a thousand", 1e-5, ray_intersect=off_from_afar)
-@finds("missed", "misses from afar in this share of directions", 3e-3, ray_intersect=missed(afar))
-def far(law: Law, case: Case) -> None:
+def far(law: Outcome, case: ShapeCase) -> None:
     """Rays from ten thousand sizes away meet what the same lines meet from nearby, to some roundings."""
     met = case.few(case.met, 2**12, 2**15)
     distance = FAR * case.size
@@ -475,14 +503,14 @@ def far(law: Law, case: Case) -> None:
     cos = abs(here.cos)
     apart = norm(np.float64(there.p) - here.p, axis=1)
     error = apart * cos / (ROUNDING * distance)
-    bad = here.met & (cos > 4 * FLAT) & (~there.met | (error > HIT_ROUNDINGS))
+    judged = here.met & (cos > 4 * FLAT)
     # a rounded origin moves the line: only what all lines around it meet counts
-    bad &= norm(here.p - goal, axis=1) < 20 * ROUNDING * distance
+    judged &= norm(here.p - goal, axis=1) < 20 * ROUNDING * distance
     across = unit(np.cross(d, case.units(len(d))))
     for side in (across, -across, np.cross(d, across), np.cross(across, d)):
         aside = trace(case.target, here.o + 4 * ROUNDING * distance * side, d)
-        bad &= aside.met & (dot(aside.n, here.n) > 0.9)
-    law.hold("missed", bad, there, other=here.o)
+        judged &= aside.met & (dot(aside.n, here.n) > 0.9)
+    law.check("missed", ~there.met | (error > HIT_ROUNDINGS), there, where=judged, other=here.o)
 
 
 def no_number_along_axis(size, si, ray):
@@ -495,7 +523,10 @@ def no_number_in_place(size, si, ray):
     return put(si, uv=dr.select(inside, dr.nan, si.uv))
 
 
-@figures(
+@finds("bad", "NaN where a component of the direction is so small", 1e-12, ray_intersect=no_number_along_axis)
+@finds("million", "NaN for a share of the rays", 2e-6, quick=2e-5, ray_intersect=no_number_in_place)
+@measures(
+    reads=most(READS, 0, READS_WHY),
     bad=number_of("hits with numbers that are not finite", 0, "one NaN spoils a picture", RAY),
     million=most(
         "hits of {count} rays at random, or sampled positions, with numbers that are not finite",
@@ -504,10 +535,14 @@ def no_number_in_place(size, si, ray):
         RAY,
     ),
 )
-@finds("bad", "NaN where a component of the direction is so small", 1e-12, ray_intersect=no_number_along_axis)
-@finds("million", "NaN for a share of the rays", 2e-6, quick=2e-5, ray_intersect=no_number_in_place)
-def finite(law: Law, case: Case) -> None:
+def finite(law: Outcome, case: ShapeCase) -> None:
     """All results are finite: of rays along axes, from the surface, the middle, corners and very far away."""
+    with reads_checked(law):
+        _extreme_rays(law, case)
+        judge_many(law, case, partial(_at_random, case))
+
+
+def _extreme_rays(law: Outcome, case: ShapeCase) -> None:
     met = case.met
     rng = case.rng
     count = case.count(2**12, 2**15)
@@ -529,11 +564,10 @@ def finite(law: Law, case: Case) -> None:
     hits = trace(case.target, o, d)
     numbers = np.column_stack([hits.t, hits.p, hits.n, hits.shading, hits.uv, hits.du, hits.dv])
     sound = np.isfinite(numbers).all(axis=1) & (hits.t >= 0)
-    law.hold("bad", np.where(hits.met, ~sound, np.isnan(hits.t)), hits)  # a miss is infinitely far
-    subject.judge_many(law, case, partial(_at_random, case))
+    law.check("bad", np.where(hits.met, ~sound, np.isnan(hits.t)), hits)  # a miss is infinitely far
 
 
-def _at_random(case: Case, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
+def _at_random(case: ShapeCase, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
     """Rays from all around and sampled positions, and which of them have numbers that are not finite."""
     middle = mi.Point3f(*map(float, case.middle))
     extent = mi.Vector3f(*map(float, case.extent))
@@ -557,12 +591,12 @@ def higher_bottom(size, box):
     return mi.BoundingBox3f((1 - 2 * size) * box.min, box.max)
 
 
-@figures(
-    outside=most("points outside the bounding box, in sizes", 1e-5, "some roundings", RAY),
-)
 @finds("outside", "a box too small above, in sizes", 3e-5, bbox=lower_top)
 @finds("outside", "a box too small below, in sizes", 3e-5, bbox=higher_bottom)
-def bbox(law: Law, case: Case) -> None:
+@measures(
+    outside=most("points outside the bounding box, in sizes", 1e-5, "some roundings", RAY),
+)
+def bbox(law: Outcome, case: ShapeCase) -> None:
     """Whatever is hit or sampled lies in the bounding box."""
     met = case.met
     points = [met.p, case.points]
@@ -571,10 +605,10 @@ def bbox(law: Law, case: Case) -> None:
     p = np.concatenate(points)
     out = np.maximum(case.box[0] - p, p - case.box[1]).max(axis=1) / case.size
     worst = min(out.argmax(), len(met.t) - 1)
-    law.hold("outside", out.max(), met[worst])
+    law.check("outside", out.max(), met[worst])
 
 
-@figures(
+@measures(
     answer=share_of("share of rays answered otherwise in {other}", 2e-3, "outlines hang on roundings", RAY),
     distance=most(
         "distance in {other}, off by roundings of the largest number",
@@ -583,12 +617,12 @@ def bbox(law: Law, case: Case) -> None:
         RAY,
     ),
 )
-def variants(law: Law, case: Case) -> None:
+def variants(law: Outcome, case: ShapeCase) -> None:
     """Hits in the scalar variant are those of the vectorised one."""
     case.with_()
     other = case.other_kind
     seen = case.few(case.seen, 500, 2000)
     there = case.elsewhere(other, lambda: trace(case.scene(), seen.o, seen.d))
-    law.hold("answer", there.met != seen.met, seen, where=seen.clear, other=other)
+    law.check("answer", there.met != seen.met, seen, where=seen.clear, other=other)
     error = abs(there.t - seen.t) / (ROUNDING * (abs(seen.o).max(axis=1) + seen.t))
-    law.hold("distance", error, seen, where=there.met & seen.steep, other=other)
+    law.check("distance", error, seen, where=there.met & seen.steep, other=other)

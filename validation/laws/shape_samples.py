@@ -10,29 +10,30 @@ import numpy as np
 from numpy.linalg import norm
 from scipy.linalg import null_space
 
-from mrt_mitsuba.validation.compare import sidak
-from mrt_mitsuba.validation.laws.faults import larger, member, off_surface, put, smaller, tilted
-from mrt_mitsuba.validation.laws.law import (
+from .faults import larger, member, off_surface, put, smaller, tilted
+from .law import (
     SIGMAS,
-    Figure,
-    Law,
-    figures,
+    Criterion,
+    Outcome,
     finds,
+    measures,
     most,
-    rare,
+    p_value,
     share_of,
+    sidak,
 )
-from mrt_mitsuba.validation.laws.noise import ROUNDING
-from mrt_mitsuba.validation.laws.probe import (
+from .noise import ROUNDING
+from .probe import (
     Array,
     Lanes,
     lanes,
     unit,
 )
-from mrt_mitsuba.validation.laws.shape_case import (
+from .shape_case import (
+    CONE,
     HIT_ROUNDINGS,
     RAY,
-    Case,
+    ShapeCase,
     dot,
     leave,
     near,
@@ -81,54 +82,6 @@ def too_short(size, ds, it, u):
     return put(ds, dist=ds.dist * dr.select(u.x < size, 0.99, 1))
 
 
-@figures(
-    position=most("density of a position against pdf_position(), relative", 1e-3, SAME, POSITIONS),
-    area=most("mean of 1 / density against surface_area(), relative", 1e-3, SAME, POSITIONS),
-    off=Figure(
-        0.9,
-        "sampled positions off the surface, 9 in 10, in roundings of the largest coordinate",
-        2 * HIT_ROUNDINGS,
-        "a few roundings",
-        RAY,
-    ),
-    normal=Figure(
-        0.9,
-        "normals of sampled positions against those of rays, 1 - cosine, 9 in 10",
-        1e-3,
-        "one surface",
-        RAY,
-    ),
-    crossings=most(
-        f"surface_area() against that by crossings of lines, relative, beyond {SIGMAS} standard errors",
-        3e-3,
-        "lines that graze may cross twice within the offset of a spawned ray",
-        POSITIONS,
-    ),
-    spread=rare("chance of such positions if they follow the area, along the worst of some axes", POSITIONS),
-    direction=Figure(
-        0.99,
-        "density of a direction against pdf_direction(), relative, 99 in 100",
-        1e-2,
-        "the same number; near outlines the cosine, and the density with it, hangs on roundings",
-        RAY,
-    ),
-    misses=share_of(
-        "share of sampled directions that miss the shape, or reach it behind the sampled point",
-        1e-2,
-        "outlines hang on roundings; small leaks are watertight's business",
-        RAY,
-    ),
-    aim=rare(
-        "chance of such directions, if they follow their density, from the worst of some places", POSITIONS
-    ),
-    angle=most(
-        "solid angle of what is visible, or its middle or width, by samples against uniform "
-        f"directions, beyond {SIGMAS} standard errors",
-        1e-2,
-        "the mean of 1 / density over what is seen; lines that graze are left room for",
-        POSITIONS,
-    ),
-)
 @finds(
     "crossings",
     "area too large, and the density of positions too small",
@@ -176,24 +129,72 @@ def too_short(size, ds, it, u):
     pdf_direction=smaller,
     sample_direction=member("pdf", smaller),
 )
-def sampling(law: Law, case: Case) -> None:
+@measures(
+    position=most("density of a position against pdf_position(), relative", 1e-3, SAME, POSITIONS),
+    area=most("mean of 1 / density against surface_area(), relative", 1e-3, SAME, POSITIONS),
+    off=Criterion(
+        0.9,
+        "sampled positions off the surface, 9 in 10, in roundings of the largest coordinate",
+        2 * HIT_ROUNDINGS,
+        "a few roundings",
+        RAY,
+    ),
+    normal=Criterion(
+        0.9,
+        "normals of sampled positions against those of rays, 1 - cosine, 9 in 10",
+        1e-3,
+        "one surface",
+        RAY,
+    ),
+    crossings=most(
+        f"surface_area() against that by crossings of lines, relative, beyond {SIGMAS} standard errors",
+        3e-3,
+        "lines that graze may cross twice within the offset of a spawned ray",
+        POSITIONS,
+    ),
+    spread=p_value("chance of such positions if they follow the area, along the worst axis", POSITIONS),
+    direction=Criterion(
+        0.99,
+        "density of a direction against pdf_direction(), relative, 99 in 100",
+        1e-2,
+        "the same number; near outlines the cosine, and the density with it, hangs on roundings",
+        RAY,
+    ),
+    misses=share_of(
+        "share of sampled directions that miss the shape, or reach it behind the sampled point",
+        1e-2,
+        "outlines hang on roundings; small leaks are watertight's business",
+        RAY,
+    ),
+    aim=p_value(
+        "chance of such directions, if they follow their density, from the worst of some places", POSITIONS
+    ),
+    angle=most(
+        "solid angle of what is visible, or its middle or width, by samples against uniform "
+        f"directions, beyond {SIGMAS} standard errors",
+        1e-2,
+        "the mean of 1 / density over what is seen; lines that graze are left room for",
+        POSITIONS,
+    ),
+)
+def sampling(law: Outcome, case: ShapeCase) -> None:
     """Sampled positions follow the area, and sampled directions the density that they state.
 
     Positions are judged by where random lines cross the surface; E[1 / pdf] is the area, and of directions
     the visible solid angle.
     """
     s, area = case.positions
-    law.hold("position", abs(s.pdf / s.again - 1))
-    law.hold("area", abs(np.mean(1 / s.pdf) / area - 1))
+    law.check("position", abs(s.pdf / s.again - 1))
+    law.check("area", abs(np.mean(1 / s.pdf) / area - 1))
     # sampled positions, and their normals, as rays meet them
     few = case.few(s, 2**14, 2**17)
     back = trace(case.target, few.p + few.n * 0.01 * case.size, unit(-few.n))
     # another part of the surface may be nearer than a hundredth of the size
     away = np.where(back.met, norm(back.p - few.p, axis=1), np.inf)
     scale = abs(few.p).max(axis=1) + 0.01 * case.size
-    law.hold("off", away / (ROUNDING * scale), back)
+    law.check("off", away / (ROUNDING * scale), back)
     cosine = np.minimum(dot(few.n, back.shading), dot(few.n, back.n)) / norm(few.n, axis=1)
-    law.hold("normal", 1 - cosine, back, where=back.met)
+    law.check("normal", 1 - cosine, back, where=back.met)
     if case.behind.met.mean() > 0.5:
         _area(law, case, s, area)
     else:
@@ -201,7 +202,7 @@ def sampling(law: Law, case: Case) -> None:
     _directions(law, case)
 
 
-def _area(law: Law, case: Case, s: Lanes, area: float) -> None:
+def _area(law: Outcome, case: ShapeCase, s: Lanes, area: float) -> None:
     """Random lines cross a surface in proportion to its area, whatever its form (Crofton)."""
     count = case.count(2**17, 2**20)
     radius = 0.5 * case.size * 1.001
@@ -224,7 +225,7 @@ def _area(law: Law, case: Case, s: Lanes, area: float) -> None:
     estimates = 2 * np.pi * radius**2 * crossed
     beyond = max(abs(estimates.mean() - area) - SIGMAS * estimates.std() / np.sqrt(count), 0)
     room = 3e-3 + 20 * float(offset(s.p).max()) / case.size + twice
-    law.hold("crossings", beyond / area, limit=room)
+    law.check("crossings", beyond / area, limit=room)
     if twice > ROOM:
         law.notes.append("parts of it coincide: where positions lie is not judged")
         return
@@ -236,7 +237,7 @@ def _area(law: Law, case: Case, s: Lanes, area: float) -> None:
         widths = np.linalg.svd(np.cov((crossings @ null_space(axis[None])).T), compute_uv=False)
         if widths[1] >= 1e-4 * widths[0]:  # else in one plane with the axis: azimuths around it are but two
             apart.append(_distance(_angle(s.p - case.middle, axis), _angle(crossings - case.middle, axis)))
-    law.hold("spread", _chance(apart, size))
+    law.check("spread", _chance(apart, size))
 
 
 AXES = 12  # aslant, along which positions are compared
@@ -277,7 +278,7 @@ def _chance(apart: Sequence[float], size: float) -> float:
     return sidak(chance, len(apart))
 
 
-def _directions(law: Law, case: Case) -> None:
+def _directions(law: Outcome, case: ShapeCase) -> None:
     """``sample_direction`` from outside: meets the shape, and states its own density."""
     u = case.uniform(case.count(2**14, 2**17), 2)
     o = case.around(len(u))
@@ -288,21 +289,21 @@ def _directions(law: Law, case: Case) -> None:
         return
     drawn = pdf > 0
     met = trace(case.target, o, d)
-    law.hold("direction", abs(pdf / again - 1), met, where=drawn)
+    law.check("direction", abs(pdf / again - 1), met, where=drawn)
     before_it = met.steep & (met.t > dist * (1 + 1e-3))
-    law.hold("misses", before_it | ~met.met, met, where=drawn)
+    law.check("misses", before_it | ~met.met, met, where=drawn)
     mean, variance = _moments(case, met, _visible(dist, pdf, met))
     # the same by uniform directions into the cone that holds the shape
     o = case.around(case.count(2**17, 2**19))
-    met = trace(case.target, o, _into_cone(case, o, case.rng))
+    met = trace(case.target, o, case.view.into_cone(o, case.rng))
     expected, other = _moments(case, met, np.where(met.met, CONE, 0))
     off = abs(mean - expected) - SIGMAS * np.sqrt(variance + other)
-    law.hold("angle", max(off.max(), 0) / expected[0])
+    law.check("angle", max(off.max(), 0) / expected[0])
     if len(u) >= 2**12:
-        law.hold("aim", _aim(case, case.count(2**17, 2**19)))
+        law.check("aim", _aim(case, case.count(2**17, 2**19)))
 
 
-def _sampled(case: Case, o: Array, u: Array) -> list[Array]:
+def _sampled(case: ShapeCase, o: Array, u: Array) -> list[Array]:
     """Sampled directions from points [N, 3]: directions, distances, and densities stated and asked for."""
 
     def sample(origin: mi.Point3f, second: mi.Point2f) -> list[mi.Float]:
@@ -320,22 +321,7 @@ def _visible(dist: Array, pdf: Array, met: Lanes) -> Array:
     return np.where(visible, 1 / np.where(pdf > 0, pdf, 1), 0)
 
 
-# the sphere around, from 1.5 sizes away: the sine of its half angle is a third
-COSINE = float(np.sqrt(1 - 1 / 9))
-CONE = 2 * np.pi * (1 - COSINE)  # its solid angle
-
-
-def _into_cone(case: Case, o: Array, rng: np.random.Generator) -> Array:
-    """Uniform directions from points [N, 3] into the cone that holds the shape. [N, 3]"""
-
-    def direction(axis: mi.Vector3f, u: mi.Point2f) -> mi.Vector3f:
-        return mi.Frame3f(axis).to_world(mi.warp.square_to_uniform_cone(u, COSINE))
-
-    u = rng.random((len(o), 2), np.float32)
-    return lanes(direction, ("Vector3f", unit(case.middle - o)), ("Point2f", u))[0]
-
-
-def _aim(case: Case, count: int) -> float:
+def _aim(case: ShapeCase, count: int) -> float:
     """The chance of such samples of directions from some places, if their density is as stated."""
     rng = np.random.default_rng((case.seed, count))
     apart = []
@@ -345,7 +331,7 @@ def _aim(case: Case, count: int) -> float:
         o = np.tile(place, (count, 1))
         d, dist, pdf, _ = _sampled(case, o, rng.random((count, 2), np.float32))
         weight = _visible(dist, pdf, trace(case.target, o, d))
-        away = _into_cone(case, o, rng)
+        away = case.view.into_cone(o, rng)
         seen = away[trace(case.target, o, away).met]
         fewest = count // 16
         if len(seen) < fewest or np.count_nonzero(weight) < fewest:  # seen edge on
@@ -358,7 +344,7 @@ def _aim(case: Case, count: int) -> float:
     return _chance(apart, size) if apart else 1.0
 
 
-def _moments(case: Case, met: Lanes, weight: Array) -> tuple[Array, Array]:
+def _moments(case: ShapeCase, met: Lanes, weight: Array) -> tuple[Array, Array]:
     """Means [8] of weights, alone and times place, its squares and the angle, and their variances [8]."""
     place = (met.p - case.middle) / case.size
     angle = (1 - dot(met.d, unit(case.middle - met.o))) * 2 * np.pi / CONE

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from mrt_mitsuba.validation.compare import sidak
-from mrt_mitsuba.validation.laws.law import NOWHERE, Law
-from mrt_mitsuba.validation.laws.probe import Array, Function, Lanes, finite_or_0, joined
+from .law import NO_LANES, Outcome, sidak
+from .probe import Array, Function, Lanes, finite_or_0, joined
 
 DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
 SIDE = 6
@@ -160,7 +159,7 @@ def summed(counts: Array, group: Array) -> Array:
     return np.array([np.bincount(group, row) for row in counts])
 
 
-def hold_small(law: Law, cells: Cells, counts: Array, known: float, at: Lanes = NOWHERE) -> None:
+def hold_small(law: Outcome, cells: Cells, counts: Array, known: float, at: Lanes = NO_LANES) -> None:
     """Hold ``small`` to the least chance of counts in cells, and ``slices`` to that of counts in their rows.
 
     ``counts`` [3, C]: samples seen, samples expected, and the variance of the latter. ``known``: the relative
@@ -169,9 +168,9 @@ def hold_small(law: Law, cells: Cells, counts: Array, known: float, at: Lanes = 
     counts = np.where(np.isfinite(counts[1]), counts, 0)  # where they are not, the law ``finite`` says so
     chances = chances_of(counts, known)
     cell = cells.bounds(int(chances.argmin()))
-    law.hold("small", least_of(chances, len(chances)), at, cell=cell)
+    law.check("small", least_of(chances, len(chances)), at, cell=cell)
     chances = np.concatenate([chances_of(summed(counts, row), known) for row in cells.rows()])
-    law.hold("slices", least_of(chances, len(chances)), at)
+    law.check("slices", least_of(chances, len(chances)), at)
 
 
 def chances_of(counts: Array, known: float) -> Array:

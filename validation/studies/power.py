@@ -13,11 +13,11 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.laws import bsdf, emitter, shape
 from mrt_mitsuba.validation.laws.bsdf import check_bsdf
+from mrt_mitsuba.validation.laws.case import Given
 from mrt_mitsuba.validation.laws.emitter import check_emitter
 from mrt_mitsuba.validation.laws.examine import Check
-from mrt_mitsuba.validation.laws.law import Fault, Judge, faults_of
+from mrt_mitsuba.validation.laws.law import Fault, Law
 from mrt_mitsuba.validation.laws.shape import check_shape
-from mrt_mitsuba.validation.laws.subject import Given
 
 Change = tuple[str, Any]  # the kind of change, and the change
 
@@ -34,7 +34,8 @@ def changed_bsdf(changes):
 
     ``changes``: by name, what is changed, and a function: of (value, ctx, wi, wo) for
     "eval", "pdf", what eval_pdf() alone gives ("pair"), or values and weights ("value"); of (bs, weight, u,
-    ctx) for "sample"; of the random numbers u for "u"; of ctx for "context". "flags" are added, to components
+    ctx) for "sample"; of what eval_null_transmission() gives for "null"; of the random numbers u for "u"; of
+    ctx for "context". "flags" are added, to components
     as well or to the "whole" alone; "active" is overlooked; an "update" adds a component.
     """
 
@@ -72,6 +73,9 @@ def changed_bsdf(changes):
         def eval_pdf(self, ctx, si, wo, active=True):
             pair = self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
             return self.changed(("pair",), pair, ctx, si.wi, wo)
+
+        def eval_null_transmission(self, si, active=True):
+            return self.changed(("null",), self.nested.eval_null_transmission(si, active))
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             asked = self.changed(("context",), ctx)
@@ -170,12 +174,12 @@ class Kind:
     """A kind of plugins: how to check them, their laws by name, and a plugin with a fault."""
 
     check: Callable[..., Check]
-    laws: Mapping[str, Judge]
+    laws: Mapping[str, Law]
     faulty: Callable[..., Given]
 
     @property
     def faults(self) -> list[Fault]:
-        return faults_of(self.laws.values())
+        return [fault for law in self.laws.values() for fault in law.faults]
 
     def check_fault(self, fault: Fault, size: float, *, quick: bool) -> Check:
         """Check a plugin with a fault of that size by the law that should find it."""
@@ -217,8 +221,8 @@ def statements() -> list[Row]:
     rows = []
     for name, kind in KINDS.items():
         for law in kind.laws.values():
-            words = str(law.__doc__).splitlines()[0].replace("``", "`").replace("|", "\\|")
-            rows.append({"plugin": name, "law": f"`{law.__name__}`", "states": words})
+            words = law.states.replace("``", "`").replace("|", "\\|")
+            rows.append({"plugin": name, "law": f"`{law.name}`", "states": words})
     return rows
 
 

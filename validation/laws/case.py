@@ -1,29 +1,33 @@
-"""A plugin under examination: how it is loaded, in any variant, and the programs that show its faults."""
+"""A plugin under test: how it is loaded, in any variant, called, and shown to fail by a program."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+import io
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass
 from textwrap import indent
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba import runtime
-from mrt_mitsuba.scene.loading import load_dict
-from mrt_mitsuba.validation.laws.law import Description, Found, Law, Skip
-from mrt_mitsuba.validation.laws.probe import Array, Lanes, is_scalar, unit
+from .law import LoadError, Outcome, Skip
+from .probe import Array, Lanes, is_scalar, unit
 
+Description = dict[str, Any]  # of a plugin, as ``mi.load_dict`` takes it
 Given = Any  # such a dict, a value of one, or a loaded plugin
+Result = TypeVar("Result")
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
+# By package, lines of a program that register its plugins: the first before Mitsuba is imported
+PREAMBLES: dict[str, tuple[str, str]] = {}
 
 
 @dataclass(frozen=True, repr=False)
-class Kept:
-    """A tensor or transform of a dict: loading uses up the one, and the other's type is the variant's."""
+class Constant:
+    """A tensor or transform of a dict: loading moves the one away, and the other's type is the variant's."""
 
     kind: str  # what makes it: "TensorXf" or "ScalarTransform4f"
     values: np.ndarray
@@ -34,8 +38,8 @@ class Kept:
         return f"mi.{self.kind}({array})" if self.values.size <= 64 else "<many numbers>"
 
 
-class Subject:
-    """A plugin under examination, given by its dict or loaded, and how thorough to be."""
+class Case:
+    """A plugin under test, given by its dict or loaded, and how thorough the test is."""
 
     word = "plugin"  # what snippets call it
 
@@ -47,11 +51,14 @@ class Subject:
         if isinstance(given, dict):
             self.description = _kept(given)
             self.name = str(given.get("type", "dict"))
-            self.plugin: mi.Object = load_dict(_made(self.description), f"the {self.name}")
+            try:
+                self.plugin: mi.Object = mi.load_dict(_made(self.description))
+            except (RuntimeError, TypeError, ValueError) as problem:
+                raise LoadError(f"cannot load the {self.name}: {reason_of(problem)}") from problem
         else:
             self.name = class_name(given)
             self.plugin = given
-        # what Mitsuba itself says against it
+        # the transform that Mitsuba warns of
         self.unsupported = _refused(self.plugin) if isinstance(self.plugin, mi.Shape) else ""
 
     def with_(self, **changes: Any) -> Description:
@@ -81,16 +88,16 @@ class Subject:
         return self.rng.random(size, np.float32)
 
     def count(self, quick: int, full: int) -> int:
-        """How many lanes to use."""
+        """The number of lanes to use."""
         number = quick if self.quick else full
         return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
 
     def few(self, lanes: Lanes, quick: int, full: int) -> Lanes:
-        """The first lanes, so many."""
+        """The first of some lanes."""
         return lanes[: self.count(quick, full)]
 
     def program(self, body: str, **names: Any) -> str:
-        """A program that loads the plugin and runs ``body``, filled with ``names``."""
+        """A program that loads the plugin and runs ``body``, formatted with ``names``."""
         setups = [setup for name, setup in _SETUP.items() if names.get(name) is not None]
         text = "".join(setups) + "\n" + body
         if "variants" in names:
@@ -98,32 +105,47 @@ class Subject:
             text = "for variant in {variants}:\n" + indent(text, "    ")
         kind = "llvm_ad_" if "PCG32(n)" in text else "scalar_"
         variant = mi.variant().replace("scalar_", kind)
-        ours = "'mrt_" in repr(self.description)
-        start = "import drjit as dr\nimport mitsuba as mi\nimport numpy as np\n\n"
-        start += f"mi.set_variant({variant!r})\n"
-        if ours:
-            start = f"import mrt_mitsuba as mrt  # before mitsuba\n{start}mrt.register()\n"
         values = {name: _written(value) for name, value in names.items()}
-        return start + self._loading(ours) + text.format(**values)
+        first, later = self._imports()
+        start = [*first, "import drjit as dr", "import mitsuba as mi", "import numpy as np", ""]
+        start += [f"mi.set_variant({variant!r})", *later, ""]
+        return "\n".join(start) + self._loading() + text.format(**values)
 
-    def _loading(self, ours: bool) -> str:
+    def _imports(self) -> tuple[list[str], list[str]]:
+        """Lines that register the classes in Python of the plugin: before Mitsuba is imported, and after."""
+        objects = [self.plugin]
+        with suppress(Exception):  # a traverse() of a plugin in Python may raise
+            objects += mi.traverse(self.plugin).hierarchy
+        first = set()
+        later = set()
+        for module in {type(x).__module__ for x in objects}:
+            package = module.split(".")[0]
+            if package in PREAMBLES:
+                first.add(PREAMBLES[package][0])
+                later.add(PREAMBLES[package][1])
+            elif module == "__main__":
+                later.add(f"# register {self.name!r} here")
+            elif package not in ("builtins", "mitsuba", "drjit"):
+                later.add(f"import {module}  # registers its plugins")
+        return sorted(first), sorted(later)
+
+    def _loading(self) -> str:
         """The part of a program that defines ``load`` and loads the plugin."""
         source = repr(self.description)
         with suppress(Exception):  # some dicts hold objects without a source text
             if eval(source, {"mi": mi, "np": np}):
-                stock = type(self.plugin).__module__.startswith("mitsuba")
-                reminder = "" if ours or stock else f"# register {self.name!r} here\n"
                 loading = f"mi.load_dict({{**{source}, **more}})"
-                return f"{reminder}\ndef load(**more):\n    return {loading}\n\n{self.word} = load()\n"
+                return f"\ndef load(**more):\n    return {loading}\n\n{self.word} = load()\n"
         return f"# {self.word}: the object that was checked\nload = lambda: {self.word}\n"
 
-    def elsewhere(self, other: str, call: Callable[[], Found]) -> Found:
+    def elsewhere(self, other: str, call: Callable[[], Result]) -> Result:
         """Call a function in another variant. Raises ``Skip`` where that cannot run."""
-        if other not in mi.variants() or runtime.obstacle(other):
-            raise Skip(f"{other} cannot run here")
         here = mi.variant()
         try:
-            runtime.use(other)
+            try:
+                mi.set_variant(other)
+            except ImportError as problem:
+                raise Skip(f"{other} cannot run here") from problem
             return call()
         except RuntimeError as problem:
             if "not found" not in str(problem):
@@ -131,7 +153,7 @@ class Subject:
             fix = "register it there (mi.detail.add_variant_callback)"
             raise Skip(f"{other} does not know the plugin: {fix}") from None
         finally:
-            runtime.use(here)
+            mi.set_variant(here)
 
     @property
     def other_kind(self) -> str:
@@ -140,10 +162,28 @@ class Subject:
         return here.replace("scalar_", "llvm_ad_") if is_scalar() else f"scalar_{here.split('_', 2)[-1]}"
 
 
+READS = "reads beyond the end of an array{said}"
+READS_WHY = "they end the process, or return anything: an index that is NaN, or out of range"
+
+
+@contextmanager
+def reads_checked(law: Outcome) -> Iterator[None]:
+    """Let Dr.Jit leave out reads beyond arrays, which may end the process, and check that there are none."""
+    log = io.StringIO()
+    with redirect_stderr(log), dr.scoped_set_flag(dr.JitFlag.Debug, True):
+        yield
+    lines = log.getvalue().splitlines()
+    reads = [line for line in lines if "out-of-bounds" in line]
+    law.check("reads", len(reads), said=f": {reads[0]}" if reads else "")
+    for line in lines:
+        if line not in reads:
+            print(line, file=sys.stderr)
+
+
 def judge_many(
-    law: Law, case: Subject, call: Callable[[Callable[[], mi.Float]], tuple[mi.Mask, dict[str, mi.Point3f]]]
+    law: Outcome, case: Case, call: Callable[[Callable[[], mi.Float]], tuple[mi.Mask, dict[str, mi.Point3f]]]
 ) -> None:
-    """Hold ``million`` to so many lanes that a fault in one of a hundred thousand shows.
+    """Check ``million`` on so many lanes that a fault in one of a hundred thousand shows.
 
     ``call(draw)`` gives the lanes that are bad, and what else snippets show of the first of them, in terms of
     random numbers that ``draw()`` makes. Scalar variants are too slow for this.
@@ -165,7 +205,14 @@ def judge_many(
         wrong = dr.compress(bad)
     index = wrong[0] if dr.width(wrong) else 0
     first = {name: np.float32(np.array(x)[:, index]) for name, x in columns.items()}
-    law.hold("million", dr.width(wrong), count=count, **first)
+    law.check("million", dr.width(wrong), count=count, **first)
+
+
+def reason_of(problem: BaseException) -> str:
+    """The line of an error that says what happened: the last of a traceback that Mitsuba quotes."""
+    text = str(problem).strip()
+    lines = text.splitlines() or [""]
+    return lines[-1] if "Traceback (most recent" in text else lines[0]
 
 
 def class_name(plugin: mi.Object) -> str:
@@ -204,14 +251,14 @@ def _kept(value: Given) -> Given:
     if isinstance(value, dict):
         return {key: _kept(entry) for key, entry in value.items()}
     if hasattr(value, "matrix") and hasattr(value, "inverse_transpose"):
-        return Kept("ScalarTransform4f", np.array(value.matrix, np.float64))
-    return Kept("TensorXf", np.array(value)) if type(value).__name__.startswith("TensorX") else value
+        return Constant("ScalarTransform4f", np.array(value.matrix, np.float64))
+    return Constant("TensorXf", np.array(value)) if type(value).__name__.startswith("TensorX") else value
 
 
 def _made(value: Given) -> Given:
     if isinstance(value, dict):
         return {key: _made(entry) for key, entry in value.items()}
-    return getattr(mi, value.kind)(value.values) if isinstance(value, Kept) else value
+    return getattr(mi, value.kind)(value.values) if isinstance(value, Constant) else value
 
 
 def _written(value: object) -> str:
@@ -248,7 +295,7 @@ params.update()
     "wo": "wo = mi.Vector3f({wo})\ndr.make_opaque(wo)\n",
     "u": "u = {u}\nbs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))\n",
     "o": """
-scene = mi.load_dict({{"type": "scene", "shape": shape}})
+scene = mi.load_dict({{"type": "scene", "shape": shape}}) if isinstance(shape, mi.Shape) else shape
 o, d = mi.Point3f({o}), mi.Vector3f({d})
 dr.make_opaque(o, d)
 """,
