@@ -115,14 +115,13 @@ def check_scene(
     ``SceneError`` or ``UsageError`` where the scene does not open.
     """
     from mrt_mitsuba.rendering.api import open_with
-    from mrt_mitsuba.rendering.progress import Job
     from mrt_mitsuba.rendering.settings import RenderSettings
     from mrt_mitsuba.scene.open import sized
 
     progress = progress or Progress()
     settings = RenderSettings.of(**options)
     runtime.use(settings.variant)
-    source = open_with(scene, settings, Job(progress, Budget.of(settings.memory), None))
+    source = open_with(scene, settings, Budget.of(settings.memory))
 
     def each(plugins: Sequence[Any]) -> Iterator[Any]:
         with progress.stage("Laws", len(plugins)) as advance:
