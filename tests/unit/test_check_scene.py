@@ -132,13 +132,16 @@ def lights_only(monkeypatch):
 def test_a_scene_is_checked_as_it_is_rendered(monkeypatch):
     """Options are those of ``render``."""
     seen = []
-    monkeypatch.setattr(checks, "_hunt", lambda shot, *_: seen.append(shot))
+
+    def hunt(shot, *_):
+        seen.append((shot.integrator.class_name(), list(shot.sensor.film().size())))
+
+    monkeypatch.setattr(checks, "_hunt", hunt)
     monkeypatch.setattr(checks, "check_emitter", lambda *_, **__: Check("", "", {}, 0.0))
     mrt.check_scene(3, width=80, height=30, aa=2)
     ball = {"type": "scene", "ball": {"type": "sphere"}, "sensor": {"type": "perspective"}}
     mrt.check_scene(ball, integrator="direct", width=20, height=30)
-    assert [list(shot.sensor.film().size()) for shot in seen] == [[80, 30], [20, 30]]
-    assert seen[1].integrator.class_name() == "DirectIntegrator"
+    assert seen == [("MrtWhitted", [80, 30]), ("DirectIntegrator", [20, 30])]
     with pytest.raises(mrt.UsageError, match="widht"):
         mrt.check_scene(3, widht=80)
 
