@@ -17,8 +17,8 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.validation.laws import emitter as emitters
 from mrt_mitsuba.validation.laws import scene as checks
-from mrt_mitsuba.validation.laws.examine import Check
 from mrt_mitsuba.validation.laws.faults import put
+from mrt_mitsuba.validation.laws.page import Check
 from mrt_mitsuba.validation.studies import power
 from mrt_mitsuba.validation.studies.power import changed_bsdf, changed_sky
 
@@ -141,7 +141,7 @@ def test_a_scene_is_checked_as_it_is_rendered(monkeypatch):
     mrt.check_scene(3, width=80, height=30, aa=2)
     ball = {"type": "scene", "ball": {"type": "sphere"}, "sensor": {"type": "perspective"}}
     mrt.check_scene(ball, integrator="direct", width=20, height=30)
-    assert seen == [("MrtWhitted", [80, 30]), ("DirectIntegrator", [20, 30])]
+    assert seen == [("SamplingIntegrator", [80, 30]), ("DirectIntegrator", [20, 30])]
     with pytest.raises(mrt.UsageError, match="widht"):
         mrt.check_scene(3, widht=80)
 

@@ -5,9 +5,9 @@ Needs Mitsuba, Dr.Jit, NumPy and SciPy; matplotlib for the plots of a page.
 
 from .bsdf import check_bsdf as check_bsdf
 from .emitter import check_emitter as check_emitter
-from .examine import Check as Check
 from .law import LoadError as LoadError
 from .law import UsageError as UsageError
+from .page import Check as Check
 from .scene import SceneCheck as SceneCheck
 from .scene import check_scene as check_scene
 from .shape import check_shape as check_shape

@@ -10,8 +10,9 @@ from collections.abc import Iterable
 from . import bsdf_components, bsdf_gradients, bsdf_samples, bsdf_values
 from .bsdf_case import BsdfCase
 from .case import Given
-from .examine import TIMEOUT, Check, examine
+from .examine import TIMEOUT, examine
 from .law import by_name
+from .page import Check
 
 LAWS = by_name(
     bsdf_samples.sampling,

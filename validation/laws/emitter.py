@@ -13,7 +13,7 @@ from scipy import stats
 
 from . import probe
 from .case import READS, READS_WHY, Case, Given, judge_many, reads_checked
-from .examine import TIMEOUT, Check, examine
+from .examine import TIMEOUT, examine
 from .faults import DEGREE, PLACE, larger, no_number, put
 from .law import (
     SIGMAS,
@@ -29,6 +29,7 @@ from .law import (
     p_value,
     sidak,
 )
+from .page import Check
 from .probe import BEYOND, Array, Lanes, excess, lanes, method
 from .shape_case import CONE, View, alone
 from .sphere import (

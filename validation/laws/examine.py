@@ -10,60 +10,20 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import page
 from .case import Case, Given, reason_of
 from .law import Law, Outcome, Skip, UsageError
+from .page import Check
 
 TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
 
 
 class TimedOut(BaseException):
     """Raised within a law that takes too long. No ``except Exception`` of a plugin catches it."""
-
-
-@dataclass(frozen=True)
-class Check:
-    """The findings of a check of one plugin: its laws by name."""
-
-    subject: str
-    variant: str
-    laws: Mapping[str, Outcome]
-    seconds: float
-    quick: bool = False
-
-    @property
-    def failed(self) -> list[str]:
-        """Names of the laws that do not hold."""
-        return [name for name, law in self.laws.items() if not law.holds]
-
-    @property
-    def passed(self) -> bool:
-        """Whether something was checked and every law that was checked holds."""
-        return not self.failed and any(law.parts for law in self.laws.values())
-
-    @property
-    def verdict(self) -> str:
-        if self.failed:
-            return f"FAILED {', '.join(self.failed)}"
-        return "passed" if self.passed else "skipped, nothing could be checked"
-
-    def __str__(self) -> str:
-        title = f"{self.subject} in {self.variant}: {self.verdict} ({self.seconds:.1f} s)"
-        return "\n".join([title, *(f"  {law}" for law in self.laws.values())])
-
-    def save(self, folder: str | Path) -> None:
-        """Write a page (``index.html``), ``summary.json`` and ``laws.csv``. Raises ``OSError``."""
-        page.write(folder, page.files({self.subject: self}, f"Laws of plugins: {self.subject}"))
-
-    def _repr_html_(self) -> str:
-        return page.frame({self.subject: self}, f"Laws of plugins: {self.subject}")
 
 
 def examine(

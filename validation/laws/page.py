@@ -1,4 +1,4 @@
-"""The page of checks: what failed comes first, with a program, what that prints, and a plot."""
+"""The findings of a check and their page: what failed comes first, with a program, its output and a plot."""
 
 from __future__ import annotations
 
@@ -9,18 +9,16 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .law import Measurement, Outcome
-
-if TYPE_CHECKING:
-    from .examine import Check
 
 STYLE = """
 body { margin: 0 auto; padding: 1rem; max-width: 76rem; color: #1c1e21; background: #fff;
@@ -46,6 +44,44 @@ summary { cursor: pointer; margin: .6rem 0; }
 }
 """
 COLUMNS = ("subject", "law", "verdict", "criterion", "measured", "sense", "limit", "note")
+
+
+@dataclass(frozen=True)
+class Check:
+    """The findings of a check of one plugin: its laws by name."""
+
+    subject: str
+    variant: str
+    laws: Mapping[str, Outcome]
+    seconds: float
+    quick: bool = False
+
+    @property
+    def failed(self) -> list[str]:
+        """Names of the laws that do not hold."""
+        return [name for name, law in self.laws.items() if not law.holds]
+
+    @property
+    def passed(self) -> bool:
+        """Whether something was checked and every law that was checked holds."""
+        return not self.failed and any(law.parts for law in self.laws.values())
+
+    @property
+    def verdict(self) -> str:
+        if self.failed:
+            return f"FAILED {', '.join(self.failed)}"
+        return "passed" if self.passed else "skipped, nothing could be checked"
+
+    def __str__(self) -> str:
+        title = f"{self.subject} in {self.variant}: {self.verdict} ({self.seconds:.1f} s)"
+        return "\n".join([title, *(f"  {law}" for law in self.laws.values())])
+
+    def save(self, folder: str | Path) -> None:
+        """Write a page (``index.html``), ``summary.json`` and ``laws.csv``. Raises ``OSError``."""
+        write(folder, files({self.subject: self}, f"Laws of plugins: {self.subject}"))
+
+    def _repr_html_(self) -> str:
+        return frame({self.subject: self}, f"Laws of plugins: {self.subject}")
 
 
 def files(checks: Mapping[str, Check], title: str, remarks: Sequence[str] = ()) -> dict[str, bytes]:

@@ -16,7 +16,7 @@ from . import page
 from .bsdf import check_bsdf
 from .case import class_name
 from .emitter import check_emitter
-from .examine import Check
+from .page import Check
 from .probe import not_finite
 from .shape import check_shape
 

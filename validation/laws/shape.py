@@ -6,8 +6,9 @@ from collections.abc import Iterable
 
 from . import shape_hits, shape_samples
 from .case import Given
-from .examine import TIMEOUT, Check, examine
+from .examine import TIMEOUT, examine
 from .law import by_name
+from .page import Check
 from .shape_case import ShapeCase
 
 LAWS = by_name(

@@ -15,8 +15,8 @@ from mrt_mitsuba.validation.laws import bsdf, emitter, shape
 from mrt_mitsuba.validation.laws.bsdf import check_bsdf
 from mrt_mitsuba.validation.laws.case import Given
 from mrt_mitsuba.validation.laws.emitter import check_emitter
-from mrt_mitsuba.validation.laws.examine import Check
 from mrt_mitsuba.validation.laws.law import Fault, Law
+from mrt_mitsuba.validation.laws.page import Check
 from mrt_mitsuba.validation.laws.shape import check_shape
 
 Change = tuple[str, Any]  # the kind of change, and the change
