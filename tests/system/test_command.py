@@ -133,3 +133,27 @@ def test_info_and_plugins_of_a_file(mrt_command, run_command, tmp_path):
     assert "\\x9b31m" in done.stdout
     done = mrt_command("check", "a.xml", "plugins=./mine.py", "quick=1", code=None)
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("mrt ex", ["export"]),
+        ("mrt out aam", ["aamode="]),
+        ("mrt out 3 aamode=s", ["aamode=sobel"]),
+        ("mrt check scene=a", ["scene=a.xml"]),
+        ("mrt diff a b fl", ["flip="]),
+        ("mrt sweep out wor", ["workers="]),
+    ],
+)
+def test_tab_completes_words(mrt_command, tmp_path, line, words):
+    (tmp_path / "a.xml").touch()
+    variables = {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE": "1"}
+    variables |= {
+        "_ARGCOMPLETE_STDOUT_FILENAME": "found",
+        "_ARGCOMPLETE_IFS": "\n",
+        "_ARGCOMPLETE_SHELL": "fish",
+    }
+    mrt_command(**variables)
+    found = (tmp_path / "found").read_text().splitlines()
+    assert [each.split("\t")[0].strip() for each in found] == words
