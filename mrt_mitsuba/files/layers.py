@@ -13,15 +13,12 @@ AVERAGED = "averaged"  # over the rays of a pixel, as the picture is
 DERIVED = "derived"  # by a pass over the picture
 
 
-Layer = namedtuple(
-    "Layer", "name letters source doc value free_with counts internal", defaults=(None, (), "", False)
-)
+Layer = namedtuple("Layer", "name letters source doc value counts internal", defaults=(None, "", False))
 Layer.__doc__ = """A row of the table.
 
 ``letters`` name its EXR channels, in the order of the last axis. ``source``: ``FIRST_HIT``, ``AVERAGED`` or
 ``DERIVED``. ``doc``: for the page of the command. ``value``: a function of what is known along rays; None for
-a derived layer. ``free_with``: the passes that make it in any case. ``counts``: the kind of rays that it
-counts. ``internal``: it cannot be asked for.
+a derived layer. ``counts``: the kind of rays that it counts. ``internal``: it cannot be asked for.
 """
 
 _FIRST_HITS = (
@@ -31,7 +28,6 @@ _FIRST_HITS = (
         FIRST_HIT,
         "distance of the hit",
         lambda r: r.at_hit("Float", r.distance, math.inf),
-        free_with=("depth of field",),
     ),
     Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.at_hit("Vector3f", r.si.n)),
     Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo),
@@ -41,10 +37,10 @@ _FIRST_HITS = (
     Layer("material", "I", FIRST_HIT, "material, from 1; 0 for none", lambda r: r.material),
 )
 _DERIVED = (
-    Layer("edges", "Y", DERIVED, "what the edge detector measured", free_with=("edges",)),
-    Layer("samples", "Y", DERIVED, "samples of the pixel", free_with=("edges", "rounds")),
-    Layer("error", "Y", DERIVED, "standard error of the pixel", free_with=("rounds",)),
-    Layer("variance", "RGB", DERIVED, "variance of the pixel", free_with=("rounds",)),
+    Layer("edges", "Y", DERIVED, "what the edge detector measured"),
+    Layer("samples", "Y", DERIVED, "samples of the pixel"),
+    Layer("error", "Y", DERIVED, "standard error of the pixel"),
+    Layer("variance", "RGB", DERIVED, "variance of the pixel"),
     Layer("noisy", "RGB", DERIVED, "picture before denoising"),
     Layer("denoised", "Y", DERIVED, "weight of the denoised picture"),
     Layer("blur", "Y", DERIVED, "amount of blur in pixels"),

@@ -284,7 +284,7 @@ def _frames(shader: Shader, plan: Plan, job: Job) -> Passes:
     for frame in range(1, plan.frames):
         following = Passes(job, shader, plan, frame)
         following.run()
-        for name in averaged:
+        for name in [*averaged, *({"samples"} & layers.keys())]:
             layers[name] += following.layers[name]
     inside = plan.region.inside(plan.padded_region)
     for name, values in layers.items():

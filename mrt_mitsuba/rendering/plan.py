@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import importlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,6 +37,7 @@ from mrt_mitsuba.scene.open import Source
 FILM_CHANNELS = 28
 OWN_CHANNELS = 5
 ROUND_CHANNELS = 240
+MOST_SPP = 65536  # that the option ``spp`` can hold
 
 # The options that a result names: those that shape a picture
 _NAMED = (*(name for name in OPTIONS if name != "memory"), "params", "region", "integrator")
@@ -49,13 +51,24 @@ class Pass:
     """A pass over the picture. ``str()`` describes it."""
 
     name: ClassVar[str]
+    message: ClassVar[str] = ""  #: printed before it starts
+    gives: ClassVar[frozenset[str]] = frozenset()  #: layers that it makes whether asked for or not
     layers: frozenset[str] = frozenset()  #: that it traces
     pattern: SamplePattern = SamplePattern()  # noqa: RUF009 - it is frozen  #: where and when its rays start
 
-    @property
-    def repeated(self) -> str:
-        """The number of rays of each sample, in words; empty for one."""
-        return f", {self.pattern.repeats} rays each" if self.pattern.repeats > 1 else ""
+    def _counted(self, more: str = "") -> str:
+        """Return the number of samples of a pixel in words, such as "15 more samples, 2 rays each"."""
+        if self.pattern.lattice == FILM:
+            return f"{self.pattern.size}{more} samples" if self.pattern.size > 1 else f"1{more} sample"
+        count, repeats = self.pattern.count, self.pattern.repeats
+        text = f"{count}{more} sample{'s' if count > 1 else ''}"
+        return f"{text}, {repeats} rays each" if repeats > 1 else text
+
+    def _placed(self) -> str:
+        """Return the layers that are traced, and who places samples, in words."""
+        shown = [name for name in LAYERS if name in self.layers]
+        film = ", by the sampler and filter of the film" if self.pattern.lattice == FILM else ""
+        return film + (f", with {', '.join(shown)}" if shown else "")
 
 
 class FirstHits(Pass):
@@ -64,50 +77,48 @@ class FirstHits(Pass):
     name = "first hits"
 
     def __str__(self) -> str:
-        return f"first hits: 1 ray through the centre of a pixel{_with(self.layers)}"
+        return f"first hits: 1 ray through each pixel's centre{self._placed()}"
 
 
 class Exposure(Pass):
-    """The same rays in every pixel."""
+    """The same samples in every pixel."""
 
     name = "rendering"
 
     def __str__(self) -> str:
-        if self.pattern.lattice == FILM:
-            return f"{_counted(self.pattern.size, 'ray')} a pixel, placed and filtered by the film"
-        return f"{_counted(self.pattern.count, 'sample')} a pixel{self.repeated}{_with(self.layers)}"
+        return f"{self._counted()} per pixel{self._placed()}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Edges(Pass):
-    """The search for edges in the picture."""
+    """Edge detection."""
 
     name = "edges"
+    gives = frozenset({"edges", "samples"})
     detector: str  #: a key of ``DETECTORS``
     noisy: bool  #: whether it takes noise for edges
 
     def __str__(self) -> str:
         noise = ", noise will count as edges: variance needs spp >= 2" if self.noisy else ""
-        return f"edges: {self.detector}{noise}"
+        return f"edge detection: {self.detector}{noise}"
 
 
 class Refinement(Pass):
-    """Further rays in the pixels at edges."""
+    """Further samples in edge pixels."""
 
     name = "anti-aliasing"
+    message = "Computing Anti aliasing.."  # as the original program prints it
 
     def __str__(self) -> str:
-        if self.pattern.lattice == FILM:
-            rays = _counted(self.pattern.size, "ray")
-            return f"{rays} and more in edge pixels, placed and filtered by the film"
-        return f"{self.pattern.count} further samples in edge pixels{self.repeated}"
+        return f"{self._counted(' more')} in edge pixels{self._placed()}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rounds(Pass):
-    """Rounds of rays to the pixels that need them, until a goal is reached."""
+    """Adaptive sampling in rounds, until a goal is reached."""
 
     name = "rounds"
+    gives = frozenset({"samples", "error", "variance", "noisy", "denoised"})
     goal: Goal
     rmse: float | None = None  #: that the target has come to; None until a round has been traced
 
@@ -132,6 +143,8 @@ class Blur(Pass):
     """Depth of field, from the depth of each pixel."""
 
     name = "depth of field"
+    message = "Computing depth of field.."  # as the original program prints it
+    gives = frozenset({"depth"})
     mode: str  #: "report" or "corrected"
     focal_distance: float  #: that is sharp, from the camera in units of the scene
     focal_range: float  #: half-width of the sharp zone around it
@@ -140,26 +153,17 @@ class Blur(Pass):
         return f"depth of field: {self.mode}"
 
 
-def _counted(number: int, thing: str) -> str:
-    return f"{number} {thing}{'s' if number > 1 else ''}"
-
-
-def _with(layers: frozenset[str]) -> str:
-    shown = [name for name in LAYERS if name in layers]
-    return f", with {', '.join(shown)}" if shown else ""
-
-
 # ----------------------------------------- The plan -------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The facts known before a render, and every decision made from them. ``str()`` describes it."""
+    """What a render will do: the facts known before it, and every decision made from them."""
 
     scene: str  #: its number or name
     variant: str  #: of Mitsuba
     integrator: str  #: name of its plugin
-    whole: bool  #: does it give whole pictures only, rather than follow rays from the camera
+    whole: bool  #: whether it renders whole pictures only, instead of tracing given rays
     width: int  #: pixels
     height: int  #: pixels
     film: str  #: filter and pixel format, where a film is exposed by its own rules rather than a lattice
@@ -167,8 +171,7 @@ class Plan:
     kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
     facts: SceneFacts | None  #: what the kernels depend on
     region: Region  #: that is returned
-    padded_region: Region  #: with the pixels around it that filters look at
-    samples: int  #: of a pixel, where they are refined or everywhere
+    padded_region: Region  #: with the pixels around it that filters read
     channels: int  #: float32 ones kept for every pixel: the picture, its layers, and the detector's
     motion: str | None  #: "frames", "stratified", "film", or None where the camera stands still
     time_strata: int  #: while the shutter is open; 0 where the camera stands still
@@ -181,11 +184,11 @@ class Plan:
 
     @property
     def blur(self) -> Blur | None:
-        """The pass that gives the picture depth of field, if any."""
+        """The pass of the depth of field, if any."""
         return next((step for step in self.passes if isinstance(step, Blur)), None)
 
     def resolved(self, rmse: float | None, left_out: tuple[str, str] | None = None) -> Plan:
-        """The plan with the RMSE that its target has come to, and what the rounds have left out."""
+        """Return the plan with the RMSE that its target has come to, and what the rounds left out."""
         steps = (replace(step, rmse=rmse) if isinstance(step, Rounds) else step for step in self.passes)
         further = () if left_out is None else (left_out,)
         return replace(self, passes=tuple(steps), left_out=(*self.left_out, *further))
@@ -213,65 +216,12 @@ class Plan:
             lines += [f"  without {', '.join(what for what, _ in group)}: {why}"]
         return "\n".join(lines)
 
+    def __repr__(self) -> str:
+        passes = ", ".join(step.name for step in self.passes)
+        return f"<Plan for {self.scene}: {self.width}x{self.height}, {self.integrator}, passes {passes}>"
 
-@dataclass(frozen=True)
-class _Choices:
-    """Decisions that the options leave open, made for one scene; by the names of options where they are such.
-
-    Someone's own scene is rendered as Mitsuba renders it, the report's scenes as the report does.
-    """
-
-    settings: RenderSettings
-    aa: int
-    aamode: str
-    lattice: str
-    spp: int
-    focaldist: float  #: 0 for no depth of field
-    focalrange: float
-    goal: Goal | None  #: of rounds; None without them
-    detector: str | None  #: the edge detector that runs, a key of ``DETECTORS``
-    moving: str | None  #: ``motion`` of the ``Plan``
-    moments: int  #: at which a moving camera sees the scene, else 0
-    frames: int
-
-
-def _decide(settings: RenderSettings, source: Source, shader: Shader) -> _Choices:
-    whole = shader.whole
-    goal = settings.goal(source.goal)
-    aamode = NOISE if goal else settings.aamode
-    # Mitsuba's integrators draw random numbers for every ray, and their noise would pass for edges
-    plain = (source.own or whole) and shader.random and settings.aa is None
-    if aamode is None:
-        aamode = "none" if plain or whole else AAMODE
-    one = aamode == NOISE or (plain and aamode == "none")
-    aa = settings.aa or (1 if one else AA)
-    spp = settings.spp or 1
-    if goal and goal.target is None:
-        spp = goal.max_spp
-    elif settings.spp is None and source.own and plain and settings.aamode is None:
-        spp = shader.film.rays
-    lattice = settings.lattice or (FILM if source.own or whole or goal else "report")
-    refining = aamode in DETECTORS and (aa != 1 or "edges" in settings.layers)
-    distance, reach = settings.focus(source.focal_distance, source.focal_range)
-    moving = None
-    moments = 0
-    if settings.motion:
-        moving = FILM if lattice == FILM else settings.motionmode
-        moments = settings.motionsamples
-    return _Choices(
-        settings=settings,
-        aa=aa,
-        aamode=aamode,
-        lattice=lattice,
-        spp=spp,
-        focaldist=distance or 0.0,
-        focalrange=reach,
-        goal=goal,
-        detector=aamode if refining else None,
-        moving=moving,
-        moments=moments,
-        frames=moments if moving == "frames" and (refining or distance) else 1,
-    )
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(str(self))}</pre>"
 
 
 def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
@@ -279,22 +229,22 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
 
     Raises ``UsageError`` for options that do not go together, and for layers that nothing provides.
     """
-    choices = _decide(settings, source, shader)
-    _check(choices, source, shader)
+    goal = settings.goal(source.goal)
+    decided = _decided(settings, goal, source, shader)
+    _check(settings, decided, goal, source, shader)
     film = shader.film
-    on_film = choices.lattice == FILM
-    asked, possible = _layers(choices, shader)
-    traced = _traced(asked & shader.layers, choices, shader)
-    passes = tuple(_passes(traced, choices, shader))
-    names = {step.name for step in passes}
-    returned = asked | {name for name in possible if names & set(TABLE[name].free_with)}
-    returned |= possible & {"noisy", "denoised"}
-    region = Region(*(settings.region or (0, 0, source.width, source.height)))
-    reach = edges.REACH * bool(choices.detector) + dof.REACH * bool(choices.focaldist)
+    on_film = decided.lattice == FILM
+    asked, possible = _layers(decided, goal, shader)
+    traced = _traced(asked & shader.layers, decided, shader)
+    passes = tuple(_passes(traced, decided, goal, shader))
+    returned = asked.union(*(step.gives & possible for step in passes))
+    region = Region(*(decided.region or (0, 0, source.width, source.height)))
+    reach = edges.REACH * bool(_detector(decided)) + dof.REACH * bool(decided.focaldist)
     channels = sum(len(TABLE[name].letters) for name in traced | returned)
     if on_film:  # sums by pixel, in double precision, while a film is exposed
-        channels += ROUND_CHANNELS if choices.goal else FILM_CHANNELS
+        channels += ROUND_CHANNELS if goal else FILM_CHANNELS
         channels += OWN_CHANNELS * len(film.bands + shader.aovs)
+    motion = decided.motionmode if decided.motion else None
     return Plan(
         scene=source.name,
         variant=str(mi.variant()),
@@ -308,25 +258,74 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
         facts=shader.facts,
         region=region,
         padded_region=region.grown(reach, source.width, source.height),
-        samples=choices.aa**2,
         channels=channels,
-        motion=choices.moving,
-        time_strata=choices.moments,
-        frames=choices.frames,
-        seed=settings.seed,
+        motion=FILM if motion and on_film else motion,
+        time_strata=_strata(decided),
+        frames=_frames(decided),
+        seed=decided.seed,
         layers=returned,
         passes=passes,
-        options=_in_force(choices, source, shader, returned),
-        left_out=tuple(_left_out(traced, names, source, shader, choices)),
+        options=_in_force(decided, goal, source, shader, returned),
+        left_out=tuple(_left_out(traced, {type(step) for step in passes}, source, shader, (decided, goal))),
     )
 
 
-def _in_force(choices: _Choices, source: Source, shader: Shader, returned: frozenset[str]) -> dict[str, Any]:
-    """The options that shape the picture, with the values that were decided."""
-    settings = choices.settings
-    goal = choices.goal
-    values = vars(settings) | vars(choices)
-    values |= {
+# --------------------------------------- Its decisions ----------------------------------------
+
+
+def _decided(settings: RenderSettings, goal: Goal | None, source: Source, shader: Shader) -> RenderSettings:
+    """Return the settings with values for options that were left open.
+
+    A scene of the user's is rendered as Mitsuba renders it, the report's scenes as the report does.
+    """
+    whole = shader.whole
+    aamode = NOISE if goal else settings.aamode
+    # Mitsuba's integrators draw random numbers for every ray, and their noise would pass for edges
+    plain = (source.own or whole) and shader.random and settings.aa is None
+    if aamode is None:
+        aamode = "none" if plain or whole else AAMODE
+    one = aamode == NOISE or (plain and aamode == "none")
+    spp = settings.spp or 1
+    if goal and goal.target is None:
+        spp = min(goal.max_spp, MOST_SPP)
+    elif settings.spp is None and source.own and plain and settings.aamode is None:
+        spp = shader.film.rays
+    distance, reach = settings.focus(source.focal_distance, source.focal_range)
+    return replace(
+        settings,
+        aa=settings.aa or (1 if one else AA),
+        aamode=aamode,
+        lattice=settings.lattice or (FILM if source.own or whole or goal else "report"),
+        spp=spp,
+        focaldist=distance or 0.0,
+        focalrange=reach,
+    )
+
+
+def _detector(settings: RenderSettings) -> str | None:
+    """Return the edge detector that runs, a key of ``DETECTORS``, if any."""
+    refining = settings.aa != 1 or "edges" in settings.layers
+    return settings.aamode if settings.aamode in DETECTORS and refining else None
+
+
+def _strata(settings: RenderSettings) -> int:
+    """Return into how many parts the time is divided; 0 where the camera stands still."""
+    return settings.motionsamples if settings.motion else 0
+
+
+def _frames(settings: RenderSettings) -> int:
+    """Return how many pictures are rendered, filtered and averaged."""
+    filtered = _detector(settings) or settings.focaldist
+    if settings.motion and settings.motionmode == "frames" and settings.lattice != FILM and filtered:
+        return settings.motionsamples
+    return 1
+
+
+def _in_force(
+    settings: RenderSettings, goal: Goal | None, source: Source, shader: Shader, returned: frozenset[str]
+) -> dict[str, Any]:
+    """Return the options that shape the picture, with the values that were decided."""
+    values = vars(settings) | {
         "width": source.width,
         "height": source.height,
         "fresnel": source.fresnel,
@@ -341,42 +340,39 @@ def _in_force(choices: _Choices, source: Source, shader: Shader, returned: froze
     return {name: values[name] for name in _NAMED if values[name] is not None}
 
 
-# --------------------------------------- Its decisions ----------------------------------------
-
-
-def _traced(asked: frozenset[str], choices: _Choices, shader: Shader) -> frozenset[str]:
-    """The layers that rays must give: the picture, those that passes over it read, and those asked for."""
-    traced = {"image", *asked}
-    read = DETECTORS[choices.detector] if choices.detector else ()
-    traced.update(read)
-    if choices.focaldist:
+def _traced(asked: frozenset[str], settings: RenderSettings, shader: Shader) -> frozenset[str]:
+    """Return the layers to trace: the picture, those that passes over it read, and those asked for."""
+    detector = _detector(settings)
+    read = DETECTORS[detector] if detector else ()
+    traced = {"image", *asked, *read}
+    if settings.focaldist:
         traced.add("depth")
-    if choices.spp > 1 and "image" in read:
+    if settings.spp != 1 and "image" in read:
         traced.add("square")
-    if choices.settings.count_rays:
+    if settings.count_rays:
         traced |= {name for name, layer in TABLE.items() if layer.counts} & shader.layers
     return frozenset(traced)
 
 
-def _check(choices: _Choices, source: Source, shader: Shader) -> None:
+def _check(
+    given: RenderSettings, decided: RenderSettings, goal: Goal | None, source: Source, shader: Shader
+) -> None:
     """Raise ``UsageError`` for options that do not go together."""
-    settings = choices.settings
-    goal = choices.goal
     if goal is None:
-        only = "{0} is of use only where rays go in rounds: with target or aamode=noise"
-        _refuse(settings, ("metric", "maxspp", "maxseconds", "on_round"), (), only)
-        _refuse(settings, ("denoise",), (False,), "{0} needs two half pictures: give target or spp")
+        only = "{0} is of use only with adaptive sampling: with target or aamode=noise"
+        _refuse(given, ("metric", "maxspp", "maxseconds", "on_round"), (), only)
+        _refuse(given, ("denoise",), (False,), "{0} needs two half pictures: give target or spp")
     else:
         name = f"target={goal.target}" if goal.target else "aamode=noise"
         both = (
-            f"{name} with {{0}}={{1}}: rounds share rays out over the whole film, at most maxspp of them; "
-            "leave one of them out"
+            f"{name} with {{0}}={{1}}: adaptive sampling allocates rays over the whole film, at most maxspp "
+            "of them; leave one of them out"
         )
-        if settings.error is not None:
-            _refuse(settings, ("aamode", "spp"), (NOISE,), both)
-        _refuse(settings, ("aa", "lattice", "region"), (FILM,), both)
+        if given.error is not None:
+            _refuse(given, ("aamode", "spp"), (NOISE,), both)
+        _refuse(given, ("aa", "lattice", "region"), (FILM,), both)
         if goal.denoise:
-            if choices.focaldist:
+            if decided.focaldist:
                 raise UsageError("denoise with depth of field as a filter: write focaldist=0")
             with needs_extra("denoise"):
                 importlib.import_module("pyoidn")
@@ -388,15 +384,15 @@ def _check(choices: _Choices, source: Source, shader: Shader) -> None:
             )
         alone = f"the integrator {shader.name} gives whole pictures, and no single rays"
         leave = f"{{0}}={{1}}: {alone}; leave it out, or choose another, such as path"
-        _refuse(settings, ("aamode", "lattice", "motion"), ("none", FILM), leave)
-        if choices.focaldist:
+        _refuse(given, ("aamode", "lattice", "motion"), ("none", FILM), leave)
+        if decided.focaldist:
             raise UsageError(
-                f"focaldist={choices.focaldist}: {alone}; write focaldist=0, or choose another, such as path"
+                f"focaldist={decided.focaldist}: {alone}; write focaldist=0, or choose another, such as path"
             )
-    x, y, width, height = settings.region or (0, 0, 1, 1)
+    x, y, width, height = given.region or (0, 0, 1, 1)
     if x + width > source.width or y + height > source.height:
         size = f"{source.width}x{source.height} pixels"
-        raise UsageError(f"region={settings.region}: it exceeds the picture, {size}")
+        raise UsageError(f"region={given.region}: it exceeds the picture, {size}")
 
 
 def _refuse(settings: RenderSettings, options: Sequence[str], allowed: Sequence[str], text: str) -> None:
@@ -410,24 +406,26 @@ def _refuse(settings: RenderSettings, options: Sequence[str], allowed: Sequence[
             raise UsageError(text.format(option, value))
 
 
-def _layers(choices: _Choices, shader: Shader) -> tuple[frozenset[str], frozenset[str]]:
-    """The layers that are asked for, and those that can be made."""
+def _layers(
+    settings: RenderSettings, goal: Goal | None, shader: Shader
+) -> tuple[frozenset[str], frozenset[str]]:
+    """Return the layers that are asked for, and those that can be made."""
     derived = {name for name in TABLE if TABLE[name].source == DERIVED}
-    asked = frozenset(choices.settings.layers)
+    asked = frozenset(settings.layers)
     known = shader.layers | derived
     possible = set(known)
-    if choices.goal is None:
+    if goal is None:
         possible -= {"error", "variance"}
-    if choices.goal is None or not choices.goal.denoise:
+    if goal is None or not goal.denoise:
         possible -= {"noisy", "denoised"}
-    if choices.aamode not in DETECTORS:
+    if settings.aamode not in DETECTORS:
         possible -= {"edges"}
     if asked == LAYERS.keys():
         return asked & possible, frozenset(possible)
     missing = sorted(asked - possible)
     if "edges" in missing:
         detectors = ", ".join(DETECTORS)
-        raise UsageError(f"layers=edges: aamode={choices.aamode} looks for none; choose one of {detectors}")
+        raise UsageError(f"layers=edges: aamode={settings.aamode} looks for none; choose one of {detectors}")
     if not known.isdisjoint(missing):
         raise UsageError("layers=error,variance: only rounds estimate them; give a target= or aamode=noise")
     if missing:
@@ -436,99 +434,102 @@ def _layers(choices: _Choices, shader: Shader) -> tuple[frozenset[str], frozense
     return asked, frozenset(possible)
 
 
-def _passes(traced: frozenset[str], choices: _Choices, shader: Shader) -> Iterator[Pass]:
-    """The passes over the picture, in their order."""
-    on_film = choices.lattice == FILM
-    all_samples = _samples(choices)
+def _passes(
+    traced: frozenset[str], settings: RenderSettings, goal: Goal | None, shader: Shader
+) -> Iterator[Pass]:
+    """Yield the passes over the picture, in their order."""
+    on_film = settings.lattice == FILM
+    detector = _detector(settings)
+    all_samples = _samples(settings)
     at_centre = frozenset(name for name in traced if TABLE[name].source == FIRST_HIT)
-    if at_centre and (on_film or (choices.detector is None and not all_samples.holds_centre)):
+    if at_centre and (on_film or (detector is None and not all_samples.holds_centre)):
         # layers of the first hit belong to the pixel's centre
-        yield FirstHits(layers=at_centre, pattern=SamplePattern(time_strata=min(choices.moments, 1)))
+        yield FirstHits(layers=at_centre, pattern=SamplePattern(time_strata=min(_strata(settings), 1)))
         traced -= at_centre
-    if choices.goal:
-        yield Rounds(layers=traced, pattern=SamplePattern(FILM), goal=choices.goal)
-    elif choices.detector is None:
+    if goal:
+        yield Rounds(layers=traced, pattern=SamplePattern(FILM), goal=goal)
+    elif detector is None:
         yield Exposure(layers=traced, pattern=all_samples)
     else:
         # a detector must see no noise: it looks at the centre of each pixel
-        places = replace(all_samples, count=1) if on_film else _centre(choices)
-        noisy = shader.random and places.repeats == 1 and "image" in DETECTORS[choices.detector]
-        yield Exposure(layers=traced, pattern=places)
-        yield Edges(detector=choices.detector, noisy=noisy)
-        if choices.aa > 1:
+        pattern = replace(all_samples, count=1) if on_film else _centre(settings)
+        noisy = shader.random and pattern.repeats == 1 and "image" in DETECTORS[detector]
+        yield Exposure(layers=traced, pattern=pattern)
+        yield Edges(detector=detector, noisy=noisy)
+        if settings.aa != 1:
             first = 1 if on_film or all_samples.holds_centre else 0  # the centre is not traced again
-            places = _samples(choices, first)
-            yield Refinement(layers=traced - at_centre - {"square"}, pattern=places)
-    if choices.focaldist:
-        mode = choices.settings.dof
-        yield Blur(mode=mode, focal_distance=choices.focaldist, focal_range=choices.focalrange)
+            yield Refinement(layers=traced - at_centre - {"square"}, pattern=_samples(settings, first))
+    if settings.focaldist and settings.focalrange is not None:
+        focus: dict[str, Any] = {"focal_distance": settings.focaldist, "focal_range": settings.focalrange}
+        yield Blur(mode=settings.dof, **focus)
 
 
-def _samples(choices: _Choices, first: int = 0) -> SamplePattern:
-    """The samples of a pixel from number ``first`` on."""
-    repeats = choices.spp
-    moments = choices.moments
-    count = choices.aa**2 - first
-    stratified = choices.settings.motionmode == "stratified"
-    if choices.lattice == FILM:  # each ray has a moment of its own
-        wanted = math.ceil(moments / choices.aa**2) if stratified else repeats * moments
-        return SamplePattern(FILM, choices.aa, first=first, count=count, repeats=max(repeats, wanted))
-    if moments and stratified:  # every ray of a pixel in a part of its own
-        rays = repeats * math.ceil(moments / (count * repeats))
-        return SamplePattern(
-            choices.lattice, choices.aa, first, count, repeats=rays, time_strata=count * rays, phase=None
-        )
-    return replace(_centre(choices), lattice=choices.lattice, aa=choices.aa, first=first, count=count)
+def _samples(settings: RenderSettings, first: int = 0) -> SamplePattern:
+    """Return the samples of a pixel from number ``first`` on."""
+    aa = settings.aa or AA
+    repeats = settings.spp or 1
+    strata = _strata(settings)
+    lattice: dict[str, Any] = {"lattice": settings.lattice, "aa": aa, "first": first}
+    lattice["count"] = count = aa**2 - first
+    stratified = settings.motionmode == "stratified"
+    if settings.lattice == FILM:  # each ray has a time of its own
+        wanted = math.ceil(strata / aa**2) if stratified else repeats * strata
+        return SamplePattern(**lattice, repeats=max(repeats, wanted))
+    if strata and stratified:  # every ray of a pixel in a stratum of its own
+        rays = repeats * math.ceil(strata / (count * repeats))
+        return SamplePattern(**lattice, repeats=rays, time_strata=count * rays, phase=None)
+    return replace(_centre(settings), **lattice)
 
 
-def _centre(choices: _Choices) -> SamplePattern:
-    """The pixel's centre alone, at the same times in every pixel."""
-    moments = choices.moments if choices.frames == 1 else 1
-    phase = 0.5 if choices.settings.motionmode == "stratified" else 0.0
-    return SamplePattern(repeats=choices.spp * max(moments, 1), time_strata=moments, phase=phase)
+def _centre(settings: RenderSettings) -> SamplePattern:
+    """Return the pixel's centre alone, at the same times in every pixel."""
+    strata = _strata(settings) if _frames(settings) == 1 else 1
+    phase = 0.5 if settings.motionmode == "stratified" else 0.0
+    return SamplePattern(repeats=(settings.spp or 1) * max(strata, 1), time_strata=strata, phase=phase)
 
 
 def _left_out(
-    traced: frozenset[str], passes: set[str], source: Source, shader: Shader, choices: _Choices
+    traced: frozenset[str],
+    passes: set[type[Pass]],
+    source: Source,
+    shader: Shader,
+    decided: tuple[RenderSettings, Goal | None],
 ) -> Iterator[tuple[str, str]]:
-    """The parts that kernels and passes leave out, each with its reason."""
+    """Yield the parts that kernels and passes leave out, each with its reason."""
+    settings, goal = decided
     for name, why in shader.kernel.reasons if shader.kernel else ():
         yield kernel_plan.WHAT.get(name, name), why
-    if Edges.name not in passes:
+    if Edges not in passes:
         why = "aa=1 has no further samples to add"
-        if choices.goal:
-            why = "rounds go where the variance is"
-        elif choices.aamode == "none":
+        if goal:
+            why = "adaptive sampling allocates samples by variance"
+        elif settings.aamode == "none":
             why = "aamode=none gives every pixel all its samples"
-        yield "edge pass", why
-    if Blur.name not in passes:
+        yield "edge detection", why
+    if Blur not in passes:
         yield Blur.name, "no focal distance"
     if "depth" not in traced:
         yield "depth", "nothing needs it"
     for name in LAYERS:
         if name in shader.layers - traced - {"depth"}:
             yield name, "not asked for"
-    yield from _ignored(source, shader.film, choices)
+    yield from _ignored(source, shader.film, settings.lattice == FILM, goal)
 
 
-def _ignored(source: Source, film: Film, choices: _Choices) -> Iterator[tuple[str, str]]:
-    """The wishes of the film and its sampler that are not followed, each with its reason."""
-    if choices.lattice != FILM:
+def _ignored(source: Source, film: Film, on_film: bool, goal: Goal | None) -> Iterator[tuple[str, str]]:
+    """Yield the settings of the film and its sampler that are ignored, each with its reason."""
+    if not on_film:
         if source.own:
-            yield (
-                f"{film.rfilter.class_name()} and {film.sampler}",
-                "the lattice that was asked for places and averages samples",
-            )
+            why = "the lattice that was asked for places and averages samples"
+            yield f"{film.rfilter.class_name()} and {film.sampler}", why
         return
     if film.pixel_format.startswith("xyz"):
-        yield f"pixel format {film.pixel_format}", ("pictures are linear sRGB, whose luminance or XYZ follow")
+        yield f"pixel format {film.pixel_format}", "pictures are linear sRGB, whose luminance or XYZ follow"
     if film.bands:
-        yield (
-            f"{', '.join(film.bands)} in the picture, only as layers",
-            ("the picture is the colour of the spectrum that the film sees, and rounds go by it"),
-        )
+        why = "the picture is the colour of the spectrum that the film sees, and sampling adapts to it"
+        yield f"{', '.join(film.bands)} in the picture, only as layers", why
     if mi.variant().startswith("scalar"):
         if film.sampler != "IndependentSampler":
-            yield film.sampler, "a scalar variant draws independent numbers, ray by ray"
-    elif choices.goal:
-        yield film.sampler, "rounds continue one sequence of numbers in each pixel"
+            yield film.sampler, "scalar variants draw independent numbers, ray by ray"
+    elif goal:
+        yield film.sampler, "adaptive sampling continues one sequence in each pixel"

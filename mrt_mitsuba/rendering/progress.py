@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SECONDS = 0.1  # between two looks at what kernels took
-# What the original program prints before a stage
-ANNOUNCEMENTS = {"anti-aliasing": "Computing Anti aliasing..", "depth of field": "Computing depth of field.."}
 
 ROUNDS = "Rounds"  # title of the stages in which rays go to where they are needed
 
@@ -206,7 +204,7 @@ class Job:
         """Open a stage of the progress, and measure its time."""
         start = time.perf_counter()
         self.collect()
-        with self.progress.stage(name.capitalize(), total, message or ANNOUNCEMENTS.get(name, "")) as advance:
+        with self.progress.stage(name.capitalize(), total, message) as advance:
 
             def advance_and_collect(steps: int) -> None:
                 advance(steps)

@@ -131,7 +131,7 @@ def test_luminance_and_what_is_not_kept_are_said():
     xyz = _load("spot", film={"pixel_format": "xyz"})
     assert "without pixel format xyz: pictures are linear sRGB" in str(mrt.render(xyz, spp=1).plan)
     noise = str(mrt.render(_load("stratified"), aamode="noise", spp=16).plan)
-    assert "without StratifiedSampler: rounds continue one sequence" in noise
+    assert "without StratifiedSampler: adaptive sampling continues" in noise
     assert "the lattice that was asked for" in str(mrt.render(scene, lattice="centered", spp=1).plan)
 
 
@@ -439,18 +439,18 @@ def test_errors_are_those_of_the_finished_picture():
 
 
 contrary = Cases()
-contrary({"target": 0.1, "aa": 2}, "target=0.1 with aa=2: rounds share rays out")
-contrary({"target": 0.1, "spp": 9}, "target=0.1 with spp=9: rounds share rays out .* maxspp")
-contrary({"target": 0.1, "region": (0, 0, 4, 4)}, "with region=.*: rounds share rays out")
+contrary({"target": 0.1, "aa": 2}, "target=0.1 with aa=2: adaptive sampling allocates")
+contrary({"target": 0.1, "spp": 9}, "target=0.1 with spp=9: adaptive sampling allocates .* maxspp")
+contrary({"target": 0.1, "region": (0, 0, 4, 4)}, "with region=.*: adaptive sampling allocates")
 contrary({"aamode": "noise", "spp": 64, "aa": 2}, "aamode=noise with aa=2")
-contrary({"maxspp": 100}, "maxspp is of use only where rays go in rounds")
+contrary({"maxspp": 100}, "maxspp is of use only with adaptive sampling")
 contrary({"on_round": print}, "on_round is of use only")
 contrary({"target": 0.1, "on_round": 3}, "on_round=3: must be a function")
 contrary({"progress": 3}, "progress=3: must be a")
 contrary({"aamode": "noise"}, "give the mean of a pixel")
 contrary({"aamode": "noise", "spp": 8}, "16 or more")
 contrary({"target": 0.1, "aamode": "sobel"}, "target=0.1 with aamode=sobel: .* leave one of them out")
-contrary({"target": 0.1, "lattice": "centered"}, "with lattice=centered: rounds share rays out")
+contrary({"target": 0.1, "lattice": "centered"}, "with lattice=centered: adaptive sampling allocates")
 contrary({"layers": ["error"]}, "only rounds estimate them")
 contrary({"camera": (0, 0, 1)}, "camera is of use only with an OBJ file")
 contrary({"params": {"x": 1}}, "only an XML file declares names")

@@ -115,11 +115,33 @@ def test_direct_light_equals_mitsubas_direct(kind):
     assert np.median(difference) < 1e-6
 
 
+MOVING = {"motion": (0.1, 0, 0), "motionsamples": 4}
+counted = Cases()
+counted({"spp": 64, "integrator": "path"}, name="film")
+counted({"aamode": "none", "aa": 3, "spp": 2, "lattice": "report"}, name="lattice")
+counted({"aamode": "luma", "aa": 2, "lattice": "report"}, name="refined")
+counted({"aamode": "luma", "aa": 2, "spp": 2, "integrator": "path"}, name="film, refined")
+counted({"aamode": "luma", "aa": 2, "lattice": "report", **MOVING}, name="frames")
+counted({"aamode": "none", "aa": 1, "lattice": "report", **MOVING}, name="moments")
+counted({"spp": 4, "integrator": "ptracer"}, name="whole")
+counted({"spp": 16, "aamode": "noise", "integrator": "path"}, name="adaptive")
+
+
+@pytest.mark.parametrize("options", counted)
+def test_samples_counts_the_rays_of_each_pixel(options):
+    nodes = mrt.scene_dict(0, width=24, height=18, flavor="stock")
+    nodes["sensor"]["film"]["rfilter"] = {"type": "box"}
+    nodes["lamp"] = {"type": "sphere", "center": [0, 9, 0], "emitter": {"type": "area"}}
+    result = mrt.render(nodes, **{"layers": ["samples"], "focaldist": 0, **options})
+    assert result.layers["samples.Y"].sum() == result.rays["primary"]
+
+
 def test_adaptive_sampling_works_over_a_stock_integrator():
     scene = mi.load_dict(mrt.scene_dict(0, width=64, height=48, flavor="stock"))
     result = mrt.render(scene, integrator="path", spp=8, aa=2, aamode="sobel", layers=["albedo", "normal"])
-    refined = (result.layers["samples.Y"] > 1).sum()
+    refined = (result.layers["samples.Y"] > 8).sum()
     assert 0 < refined < 64 * 48
+    assert result.layers["samples.Y"].sum() == result.rays["primary"] - 64 * 48
     # the layers come from one ray through the centre of each pixel
     assert result.rays["primary"] == 64 * 48 + 8 * (64 * 48 + 3 * refined)
     assert np.isfinite(result.image).all()

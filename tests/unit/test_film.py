@@ -11,6 +11,7 @@ from nodes import sensor
 from numpy.testing import assert_allclose
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.rendering.canvas import Canvas
 from mrt_mitsuba.rendering.film import Film
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -43,6 +44,29 @@ def test_noise_under_a_filter_has_its_variance_and_correlation(rfilter):
     assert np.mean(power**2) / 2 == pytest.approx(film.correlation, rel=0.08)
     alike = np.ones((1, *film.shape))
     assert_allclose(film.filtered_variance(alike), alike, rtol=1e-6)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_moments_of_a_canvas(variant, rfilter):
+    """Sums of colours and squares, and the mean colour of the brightest ray, of two puts."""
+    film = Film(mi.load_dict(sensor([0, 0, 1], [0, 0, 0], (3, 2), rfilter=rfilter)))
+    rng = np.random.default_rng(0)
+    canvas = Canvas(film, np.full((1, 6), 6), 3, moments=True)
+    drawn = rng.random((2, 3, 18), np.float32)  # [puts, channels, rays], three rays in each pixel
+    pixel = np.repeat(np.arange(6), 3)
+    place = np.stack([pixel % 3, pixel // 3]) + rng.random((2, 18))
+    for values in drawn:
+        if variant.startswith("scalar"):
+            canvas.put(place, list(values), np.full(6, 3))
+        else:
+            canvas.put(mi.Point2f(place), [mi.Float(channel) for channel in values], np.full(6, 3))
+    colors = np.moveaxis(drawn.reshape(2, 3, 6, 3), 0, 2).reshape(3, 6, 6)  # [channels, pixels, rays]
+    assert_allclose(canvas.total.reshape(3, 6), colors.sum(-1), rtol=1e-6)
+    assert_allclose(canvas.square.reshape(3, 6), (colors**2).sum(-1), rtol=1e-6)
+    assert_allclose(canvas.peak.ravel(), colors.mean(0).max(-1), rtol=1e-6)
+    if rfilter == "box":
+        assert_allclose((canvas.sums / canvas.weights).reshape(3, 6), colors.mean(-1), rtol=1e-6)
 
 
 @pytest.mark.parametrize("region", [None, (3, 3, 4, 4)])

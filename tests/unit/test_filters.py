@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cases import Cases
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
@@ -237,7 +237,7 @@ def test_report_equals_the_loops(backend, size, seed, focus):
 
 
 @ANY_PICTURE
-@settings(max_examples=12)
+@settings(max_examples=12, phases=[Phase.explicit, Phase.generate])  # to shrink takes minutes of loops
 def test_corrected_equals_the_loops(size, seed, focus):
     """Discs of all sizes on both sides of the focus, layers near and far apart, borders."""
     image, depth = scene(size, seed)

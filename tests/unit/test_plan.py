@@ -79,19 +79,19 @@ def test_what_the_integrator_does_not_say_is_not_made_up():
 
 
 shown = Cases()
-shown({"aamode": "none", "focaldist": 0}, "16 samples a pixel")
-shown({"aamode": "none"}, "16 samples a pixel, with depth; depth of field: report")
+shown({"aamode": "none", "focaldist": 0}, "16 samples per pixel")
+shown({"aamode": "none"}, "16 samples per pixel, with depth; depth of field: report")
 shown(
     {"aamode": "none", "lattice": "centered"},
-    "first hits: 1 ray through the centre of a pixel, with depth; 16 samples a pixel; depth of field: report",
+    "first hits: 1 ray through each pixel's centre, with depth; 16 samples per pixel; depth of field: report",
 )
-shown({"focaldist": 0, "aa": 2}, "1 sample a pixel; edges: sobel; 3 further samples in edge pixels")
+shown({"focaldist": 0, "aa": 2}, "1 sample per pixel; edge detection: sobel; 3 more samples in edge pixels")
 shown(
     {"focaldist": 0, "aa": 2, "lattice": "centered", "aamode": "geometry"},
-    "1 sample a pixel, with depth, normal; edges: geometry; 4 further samples in edge pixels",
+    "1 sample per pixel, with depth, normal; edge detection: geometry; 4 more samples in edge pixels",
 )
-shown({"focaldist": 0, "aa": 1}, "1 sample a pixel")
-shown({"focaldist": 0, "aa": 1, "layers": ["edges"]}, "1 sample a pixel; edges: sobel")
+shown({"focaldist": 0, "aa": 1}, "1 sample per pixel")
+shown({"focaldist": 0, "aa": 1, "layers": ["edges"]}, "1 sample per pixel; edge detection: sobel")
 
 
 @pytest.mark.parametrize(("options", "passes"), shown)
