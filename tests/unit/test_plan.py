@@ -142,7 +142,7 @@ IN_FRONT = scene(ball={**BALL, "center": [0, 0, 4]})
 # What an option needs to make a difference; the others make one in scene 3
 NEEDED = {
     "metric": TARGET,
-    "denoise": TARGET,
+    "denoise": {**TARGET, "focaldist": 0},
     "maxspp": TARGET,
     "maxseconds": TARGET,
     "motionsamples": MOTION,
