@@ -70,9 +70,27 @@ def decode(data: bytes) -> str:
 
 
 def find(name: str, folders: list[Path]) -> Path | None:
-    """The file ``name``, also with backslashes, in the first folder where it may be read, or None."""
-    places = (folder / form for form in (name, name.replace("\\", "/")) for folder in folders)
-    return next((place for place in places if os.path.isfile(place) and os.access(place, os.R_OK)), None)
+    """Return the file ``name`` in the first folder where it may be read, or None.
+
+    It may be written with backslashes, as on Windows or before blanks, or in quotes.
+    """
+    forms = dict.fromkeys([name, name.replace("\\ ", " "), name.replace("\\", "/"), name.strip('"')])
+    places = (os.path.join(folder, form) for form in forms for folder in folders)
+    found = next((place for place in places if os.path.isfile(place) and os.access(place, os.R_OK)), None)
+    return found and Path(found)
+
+
+def has_alpha(path: StrPath) -> bool:
+    """True if a picture is transparent somewhere."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            if "A" not in picture.getbands() and "transparency" not in picture.info:
+                return False
+            return picture.convert("RGBA").getchannel("A").getextrema()[0] < 255
+    except Exception:  # whatever the library raises on broken files; reading the texture reports it
+        return False
 
 
 def picture_size(path: str) -> tuple[int, int] | None:
@@ -99,7 +117,7 @@ def picture_size(path: str) -> tuple[int, int] | None:
 def warn_of(findings: Mapping[str, list[str]]) -> None:
     """Warn of findings, by kind in the plural: of the first, with the number of the others."""
     for kind, texts in findings.items():
-        more = f" (and so do {len(texts) - 1} more {kind})" if texts[1:] else ""
+        more = f"; {len(texts) - 1} more {kind} likewise" if texts[1:] else ""
         if texts:
             warn(f"{texts[0]}{more}")
 

@@ -143,15 +143,16 @@ def _instantiate(state: mi.parser.ParserState, merge: bool, keys: Values) -> mi.
     return loaded
 
 
-# Types of values that a scene states, as ``mi.traverse`` calls them
+# Types of values that a scene states, as ``mi.traverse`` calls them. The first variant of a process decides
+# whether their names begin with "Scalar"
 _STATED = {
     "bool": "bool",
     "int": "int",
     "float": "Float",
     "str": "str",
     "Array3f64": "Point3f",
-    "ScalarColor3d": "Color3f",
-    "ScalarAffineTransform4d": "AffineTransform4f",
+    "Color3d": "Color3f",
+    "AffineTransform4d": "AffineTransform4f",
 }
 
 
@@ -165,8 +166,11 @@ def _named(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, 
 
 
 def _stated_keys(node: mi.parser.SceneNode, place: str) -> list[str]:
-    kinds = {name: type(node.props[name]).__name__ for name in node.props}
-    return [f"{place}.{name}" for name, kind in kinds.items() if kind in _STATED]
+    return [f"{place}.{name}" for name in node.props if _kind(node.props[name]) in _STATED]
+
+
+def _kind(value: object) -> str:
+    return type(value).__name__.removeprefix("Scalar")
 
 
 def _set_stated(state: mi.parser.ParserState, keys: Values) -> Values:
@@ -178,8 +182,8 @@ def _set_stated(state: mi.parser.ParserState, keys: Values) -> Values:
             continue
         for key in keys.keys() & {*_stated_keys(node, place)}:
             name = key.rpartition(".")[2]
-            kind = type(node.props[name])
-            node.props[name] = _converted(key, unset.pop(key), kind, _STATED[kind.__name__])
+            before = node.props[name]
+            node.props[name] = _converted(key, unset.pop(key), type(before), _STATED[_kind(before)])
     return unset
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from mrt_mitsuba.errors import SceneError
+from mrt_mitsuba.errors import SceneError, warn
 from mrt_mitsuba.options import StrPath
-from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
-from mrt_mitsuba.scene.model import LARGEST, Color, Material
+from mrt_mitsuba.scene.files import MISSING, decode, find, has_alpha, read_text, warn_of
+from mrt_mitsuba.scene.model import LARGEST, Material
 
 # What the statements mean, by convention: fields of ``Material``
 CONVENTIONS = {
@@ -26,12 +27,26 @@ DEFAULT_MATERIAL = Material(
 
 _STANDARD = Material(ior=1.0, alpha=1.0, specular=(0.0, 0.0, 0.0), diffuse=(0.8, 0.8, 0.8))
 
-# What exporters write of statements that are not used, where it changes nothing; numbers without their zeros
+_KNOWN = ("Kd", "Ks", "Ka", "Ni", "Ns", "map_Kd")
+# What exporters write of statements and options that are not used, where it changes nothing; numbers without
+# their zeros
 _WITHOUT_EFFECT = {"d 1", "Tr 0", "illum 0", "illum 1", "illum 2", "sharpness 60", "Ke 0 0 0", "Tf 1 1 1"}
+_WITHOUT_EFFECT |= {"-blendu on", "-blendv on", "-clamp off", "-cc off", "-boost 0", "-bm 1", "-type sphere"}
 
 
-def read_mtl(path: StrPath, *, convention: str = "report", folder: Path | None = None) -> dict[str, Material]:
-    """The materials of an MTL file by name.
+@dataclass(frozen=True)
+class MtlMaterial:
+    """A material, and how its texture is placed: texture coordinates times ``scale`` plus ``offset``."""
+
+    material: Material
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+
+
+def read_mtl(
+    path: StrPath, *, convention: str = "report", folder: Path | None = None
+) -> dict[str, MtlMaterial]:
+    """Read the materials of an MTL file, by name.
 
     ``convention``:
 
@@ -41,67 +56,147 @@ def read_mtl(path: StrPath, *, convention: str = "report", folder: Path | None =
       which is nearest to a roughness of √(2 / (Ns + 2)) (Walter et al., "Microfacet Models for Refraction",
       2007, §5.2). Defaults of the format's description: Kd 0.8, Ks 0, Ni 1, Ns 0.
 
-    ``map_Kd`` names a picture that replaces Kd; it is looked for relative to ``folder`` (that of the OBJ
-    file), then to the MTL file. One that is missing is named in a warning and Kd is used. Values may exceed
-    1, as in the report. ``standard`` warns of statements that would change the picture and are not used.
+    ``map_Kd`` names a picture that replaces Kd, with its options ``-s``, ``-o`` and ``-mm``; it is looked for
+    relative to ``folder`` (that of the OBJ file), then to the MTL file. One that is missing is named in a
+    warning and Kd is used. Values may exceed 1, as in the report. Statements and options that would change
+    the picture and are not used are named in a warning.
 
     Raises ``SceneError`` with file and line for what cannot be read.
     """
     path = Path(path)
-    fields = CONVENTIONS[convention]
-    findings: dict[str, list[str]] = {}
-    blocks: dict[str, dict[str, Any]] = {}
-    block: dict[str, Any] | None = None
-    for number, line in enumerate(decode(read_text(path)).split("\n"), 1):
-        words = line.partition("#")[0].strip().split(maxsplit=1)
-        statement, text = [*words, "", ""][:2]
-        where = f"{path}:{number}"
-        if statement == "newmtl":
-            if not text:
-                raise SceneError(f"{where}: newmtl has no name; write newmtl NAME")
-            block = blocks[text] = {}
-        elif statement in ("Kd", "Ks", "Ka", "Ni", "Ns", "map_Kd"):
-            if block is None:
-                raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")
-            value = _value(statement, text, where, folder or path.parent, path.parent, findings)
-            if statement in fields:
-                block[fields[statement]] = value
-        # the report's reading defines itself; from the standard's, statements may be missing
-        elif convention == "standard" and statement:
-            plain = re.sub(r"\.0+\b", "", f"{statement} {text}")
-            if plain not in _WITHOUT_EFFECT:
-                findings.setdefault("statements", []).append(f"{where}: {statement} {text[:40]} is not used")
-    warn_of(findings)
+    reader = _Reader(path, convention, [folder or path.parent, path.parent])
+    number = 1
+    # a run of empty lines at once
+    for line in re.finditer(rb"[^\n]+|\n+", read_text(path)):
+        if line[0][:1] == b"\n":
+            number += len(line[0])
+        else:
+            reader.read(decode(line[0]).strip(), f"{path}:{number}")
+    reader.warn()
     default = DEFAULT_MATERIAL if convention == "report" else _STANDARD
-    return {name: replace(default, **block) for name, block in blocks.items()}
+    return {
+        name: MtlMaterial(replace(default, **fields), **reader.placements[name])
+        for name, fields in reader.blocks.items()
+    }
 
 
-def _value(
-    statement: str, text: str, where: str, folder: Path, library: Path, findings: dict[str, list[str]]
-) -> Color | float | str | None:
-    """A colour, an index, a roughness, or the path of a picture; None, with a finding, if it is missing.
+def find_material(materials: Iterable[str], text: str) -> str | None:
+    """Return the name among ``materials`` that a ``usemtl`` statement means, or None.
 
-    Raises ``SceneError`` for anything else.
+    Names may hold a number sign (``Material #1``), and a comment may follow a name in both files.
     """
-    words = text.split()
-    if statement == "map_Kd":
-        if not text:
-            raise SceneError(f"{where}: map_Kd names no file")
-        names = [text]
-        if text.startswith("-"):  # options of some words before the name, which may have blanks in it
-            names += [" ".join(words[k:]) for k in range(1, min(len(words), 32))]
-        for name in names:
-            picture = find(name, [folder, library])
-            if picture is not None:
-                return str(picture)
-        missing = f"{where}: the texture {text} {MISSING} {folder}; Kd is used in its place"
-        findings.setdefault("textures", []).append(missing)
+    plain = _without_comment(text)
+    for name in (text, plain, text.partition("#")[0].strip()):
+        if name in materials:
+            return name
+    alike = [name for name in materials if _without_comment(name) in (text, plain)]
+    return alike[0] if len(alike) == 1 else None
+
+
+def _without_comment(name: str) -> str:
+    return re.sub(r"\s+#(\s.*)?$", "", name)
+
+
+@dataclass
+class _Reader:
+    """The blocks of a file read so far."""
+
+    path: Path
+    convention: str
+    folders: list[Path]  #: where pictures are looked for
+    blocks: dict[str, dict[str, Any]] = field(default_factory=dict)  #: fields of ``Material``, by its name
+    placements: dict[str, dict[str, Any]] = field(default_factory=dict)  #: of ``MtlMaterial``
+    name: str = ""  #: of the block
+    unused: dict[str, str] = field(default_factory=dict)  #: where each statement or option is first, in words
+    missing: list[str] = field(default_factory=list)  #: textures, in words
+
+    def warn(self) -> None:
+        """Warn of what is missing and of what would change the picture and is not used."""
+        warn_of({"textures": self.missing})
+        if self.unused:
+            first, *others = self.unused
+            more = f", nor {', '.join(others[:9])}" if others else ""
+            warn(f"{self.unused[first]} is not used{more}")
+
+    def read(self, line: str, where: str) -> None:
+        """Read one statement."""
+        statement, text = [*line.split(maxsplit=1), "", ""][:2]
+        if statement.startswith("#"):
+            return
+        if statement not in ("newmtl", "map_Kd"):
+            text = text.partition("#")[0].strip()
+        elif not text:
+            problem = {"newmtl": "has no name; write newmtl NAME", "map_Kd": "names no file"}[statement]
+            raise SceneError(f"{where}: {statement} {problem}")
+        if statement == "newmtl":
+            self.name = text
+            self.blocks[text] = {}
+            self.placements[text] = {}
+        elif statement in _KNOWN:
+            if not self.name:
+                raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")
+            read = self._texture(text, where) if statement == "map_Kd" else _numbers(statement, text, where)
+            if statement in CONVENTIONS[self.convention]:
+                self.blocks[self.name][CONVENTIONS[self.convention][statement]] = read
+        elif statement:
+            self._unused(f"{statement} {text}", where)
+
+    def _unused(self, text: str, where: str) -> None:
+        if re.sub(r"\.0+\b", "", text) not in _WITHOUT_EFFECT:
+            self.unused.setdefault(text.split()[0][:48], f"{where}: {text[:48].strip()}")
+
+    def _texture(self, text: str, where: str) -> str | None:
+        """The path of a picture; None, with a finding, if it is missing. Options go into the block."""
+        for line in dict.fromkeys((text, _without_comment(text), text.partition("#")[0].strip())):
+            words = line.split()
+            # options of some words before the name, which may have blanks in it
+            for first in range(min(len(words), 32) if line.startswith("-") else 1):
+                name = " ".join(words[first:]) if first else line
+                picture = find(name, self.folders)
+                if picture is not None:
+                    self._options(words[:first], where)
+                    if has_alpha(picture):
+                        self._unused(f"alpha of {name}", where)
+                    return str(picture)
+        text = f"{where}: the texture {text} {MISSING} {self.folders[0]}; Kd is used in its place"
+        self.missing.append(text)
         return None
+
+    def _options(self, words: list[str], where: str) -> None:
+        """Take up the options of a texture."""
+        for option in re.findall(r"-[a-zA-Z]\w*(?: [^-]\S*| -[\d.]\S*)*", " ".join(words)):
+            name, *values = option.split()
+            if name == "-s":
+                scale = _floats(option, values, where)
+                self.placements[self.name]["scale"] = (*scale, 1.0)[:2]
+            elif name == "-o":
+                offset = _floats(option, values, where)
+                self.placements[self.name]["offset"] = (*offset, 0.0)[:2]
+            elif name == "-mm":
+                base, gain = (*_floats(option, values, where), 1.0)[:2]
+                self.blocks[self.name]["texture_range"] = base, gain
+            else:
+                self._unused(option, where)
+
+
+def _floats(option: str, words: list[str], where: str) -> list[float]:
+    """The one to three numbers of an option."""
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if not 1 <= len(numbers) <= 3 or not all(abs(number) <= LARGEST for number in numbers):
+        raise SceneError(f"{where}: {option[:80]!r} must have one to three finite numbers")
+    return numbers
+
+
+def _numbers(statement: str, text: str, where: str) -> Any:
+    """The colour, index or roughness of a statement. Raises ``SceneError`` for anything else."""
     counts = {1: "one number"}
     if statement[0] == "K":
         counts = {1: "one", 3: "three numbers"}
     try:
-        values = list(map(float, words))
+        values = list(map(float, text.split()))
     except ValueError:
         values = []
     if len(values) not in counts or not all(0 <= v <= LARGEST for v in values):

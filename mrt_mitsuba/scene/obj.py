@@ -21,8 +21,9 @@ import numpy as np
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.options import StrPath, check
 from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
-from mrt_mitsuba.scene.model import BLUE_SKY, CONVENTION, Camera, Color, Light, Material, Mesh, Scene, Vector
-from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, read_mtl
+from mrt_mitsuba.scene.model import BLUE_SKY, CONVENTION, Camera, Color, Light, Mesh, Scene, Vector
+from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, MtlMaterial, find_material, read_mtl
+from mrt_mitsuba.scene.polygons import triangulate
 
 # Numbers of each kind of values that are used: positions may have a weight, a colour or both behind them
 _USED = {"v": 3, "vt": 2, "vn": 3}
@@ -68,7 +69,9 @@ def _run(name: str, word: bytes) -> bytes:
 _VALUE_RUNS = "v_3 v_4 v_5 v_6 v_7 vt_1 vt_2 vt_3 vn_3"
 _RUNS = [_run(name, _REAL) for name in _VALUE_RUNS.split()]
 _RUNS += [_run(f"f_{n}_{form}", word) for n in (3, 4, 5, 6, 0) for form, (word, _) in _CORNERS.items()]
-_BLOCKS = re.compile(b"|".join(_RUNS) + rb"|(?P<line>[^\n]*\n)")
+# Lines that hold nothing used, and others: of those, one at a time
+_SKIPPED = rb"(?P<skipped>(?:[ \t]{0,99}(?:#[^\n]*|(?:g|s|o|l|p|mg)[ \t][^\n]*)?\n){1,4096})"
+_BLOCKS = re.compile(b"|".join([*_RUNS, _SKIPPED, rb"(?P<line>[^\n]*\n)"]))
 
 # Letters of keywords, slashes and line ends as blanks: what is left are the numbers
 _NUMBERS_ONLY = bytes(32 if chr(i) in "vtnf/\n" else i for i in range(256))
@@ -79,10 +82,10 @@ def read_obj(path: StrPath, *, convention: str = "report") -> tuple[tuple[Mesh, 
     used or not.
 
     Faces are ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, with positive or negative indices. One with more than
-    three corners is cut into a fan around its first corner, which is right for convex faces. Normals are used
-    by the convention "standard" for the faces that have them; else triangles are flat, and their normal
-    follows from the winding. Material libraries are looked for next to the file and read by ``convention``
-    (see ``read_mtl``); one that is missing is named in a warning. Faces of no known material get
+    three corners is cut into triangles, also where it is not convex. Normals are used by the convention
+    "standard" for the faces that have them; else triangles are flat, and their normal follows from the
+    winding. Material libraries are looked for next to the file and read by ``convention`` (see ``read_mtl``);
+    one that is missing is named in a warning, and so are unknown statements. Faces of no known material get
     ``DEFAULT_MATERIAL``.
 
     Raises ``SceneError`` with file and line for what cannot be read, ``UsageError`` for an unknown
@@ -93,7 +96,7 @@ def read_obj(path: StrPath, *, convention: str = "report") -> tuple[tuple[Mesh, 
     for block in _BLOCKS.finditer(read_text(reader.path)):
         reader.read(block)
         reader.line += block[0].count(b"\n")
-    textures = filter(None, (material.texture for material in reader.materials.values()))
+    textures = filter(None, (each.material.texture for each in reader.materials.values()))
     return reader.meshes(), frozenset({os.fspath(path), *reader.libraries, *textures})
 
 
@@ -110,17 +113,24 @@ class _Reader:
         # kinds]; the kinds, as in ``_CORNERS``; the material; the first line
         self.faces: list[tuple[np.ndarray, list[int], str, int]] = []
         self.material = ""
-        self.materials: dict[str, Material] = {}
+        self.materials: dict[str, MtlMaterial] = {}
         self.named: dict[str, str] = {}  # by the name of a material, where it was used first
         self.libraries: set[str] = set()
-        self.missing: list[str] = []
+        self.statements: set[str] = set()  # names of libraries that were looked for
+        self.findings: dict[str, list[str]] = {}
 
     def fail(self, text: str, line: int) -> NoReturn:
         raise SceneError(f"{self.path}:{line}: {text}")
 
+    def note(self, kind: str, text: str) -> None:
+        """Note what a warning will tell; ``kind``: the plural of what it is about."""
+        self.findings.setdefault(kind, []).append(f"{self.path}:{self.line}: {text}")
+
     def read(self, block: re.Match[bytes]) -> None:
         """Read a run of lines."""
         kind, *form = str(block.lastgroup).split("_")
+        if kind == "skipped":
+            return
         if kind == "line":
             self._statement(block[0])
             return
@@ -134,7 +144,10 @@ class _Reader:
             faces = np.where(index > 0, index - 1, np.where(index < 0, backwards, -1))
             self.faces.append((faces, kinds, self.material, self.line))
             return
-        values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)[:, : _USED[kind]]
+        values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)
+        if kind == "v" and values.shape[1] > 4 and "vertices" not in self.findings:
+            self.note("vertices", "colours of vertices are not used")
+        values = values[:, : _USED[kind]]
         used = np.zeros((lines, _USED[kind]), np.float32)
         with np.errstate(over="ignore"):
             used[:, : values.shape[1]] = values
@@ -160,29 +173,40 @@ class _Reader:
         elif keyword == "usemtl":
             self.material = name
             self.named.setdefault(name, where)
-        elif keyword == "mtllib":
-            folder = self.path.parent
-            for each in [name] if find(name, [folder]) else words:
-                library = find(each, [folder])
-                if library:
-                    self.libraries.add(str(library))
-                    self.materials |= read_mtl(library, convention=self.convention, folder=folder)
-                else:
-                    missing = f"{where}: the material library {each} {MISSING} {folder}"
-                    self.missing.append(f"{missing}; its materials get the default")
-        elif keyword and keyword not in _IGNORED:
-            expected = "expected v, vt, vn, f, usemtl, mtllib or the like"
-            self.fail(f"unknown statement {keyword[:40]!r}; {expected}", self.line)
+        elif keyword == "mtllib" and name not in self.statements:
+            self.statements.add(name)
+            self._libraries(name)
+        elif keyword and keyword not in _IGNORED and keyword != "mtllib":
+            self.note("statements", f"the statement {keyword[:40]!r} is unknown and is skipped")
+
+    def _libraries(self, text: str) -> None:
+        """Read the libraries that a statement names; of materials of one name, the first counts."""
+        folder = self.path.parent
+        plain = text.partition("#")[0].strip()
+        pieces = re.findall(r"\S.*?\.mtl(?=\s|$)", plain, re.IGNORECASE)  # each may have blanks in it
+        found = {name: find(name, [folder]) for name in dict.fromkeys([text, plain, *pieces, *plain.split()])}
+        whole = [name for name in (text, plain) if found[name]][:1]
+        if not whole and not pieces:
+            whole = [plain] if not any(found.values()) else plain.split()
+        for name in whole or pieces:
+            library = found[name]
+            if library is None:
+                text = f"the material library {name} {MISSING} {folder}; its materials get the default"
+                self.note("libraries", text)
+            elif str(library) not in self.libraries:
+                self.libraries.add(str(library))
+                self.materials = read_mtl(library, convention=self.convention, folder=folder) | self.materials
 
     def meshes(self) -> tuple[Mesh, ...]:
         """A mesh for each material, in the order of their first use."""
+        found = {text: find_material(self.materials, text) for text in self.named}
         unknown = [
-            f"{where}: no library has the material {name!r}; it gets the default"
-            for name, where in self.named.items()
-            if name not in self.materials
+            f"{where}: no library has the material {text!r}; it gets the default"
+            for text, where in self.named.items()
+            if found[text] is None
         ]
-        warn_of({"libraries": self.missing, "materials": unknown})
-        parts: dict[tuple[Material, bool], list[np.ndarray]] = {}
+        values = [np.concatenate(arrays) for arrays in self.values.values()]
+        parts: dict[tuple[MtlMaterial, bool], list[np.ndarray]] = {}
         for faces, kinds, name, line in self.faces:
             counts = np.array([*self.counts.values()])[kinds]
             for row, corner, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
@@ -194,38 +218,42 @@ class _Reader:
                         f"a {kind} index of 0, or before the first; indices count from 1, or back from -1"
                     )
                 self.fail(f"f has {problem}", line + row)
-            material = self.materials.get(name, DEFAULT_MATERIAL)
-            if 1 not in kinds:
-                material = replace(material, texture=None)  # no coordinates to look it up
-            second = np.arange(1, faces.shape[1] - 1)  # corners of the triangles of a fan
+            used = self.materials.get(found.get(name) or "", MtlMaterial(DEFAULT_MATERIAL))
+            if 1 not in kinds:  # no coordinates to look it up
+                used = MtlMaterial(replace(used.material, texture=None, texture_range=(0.0, 1.0)))
             corners = np.zeros((*faces.shape[:2], len(_USED)), np.int64)  # [F, corners, kinds]
             corners[:, :, kinds] = faces
-            fan = np.stack([0 * second, second, second + 1], axis=1)  # [triangles of a face, 3]
-            triangles = corners[:, fan].reshape(-1, 3, len(_USED))
+            cut, crossing = triangulate(values[0][corners[:, :, 0]])
+            for row in np.flatnonzero(crossing)[:1]:
+                self.line = line + int(row)
+                self.note("faces", "the face crosses itself, or is too large; it may be drawn in part")
+            triangles = np.take_along_axis(corners[:, None], cut[..., None], axis=2)
             smooth = self.convention == "standard" and 2 in kinds
-            parts.setdefault((material, smooth), []).append(triangles)
+            parts.setdefault((used, smooth), []).append(triangles.reshape(-1, 3, len(_USED)))
+        warn_of(self.findings | {"materials": unknown})
         if not parts:
             raise SceneError(f"{self.path}: has no faces; export the model with its geometry")
-        values = [np.concatenate(arrays) for arrays in self.values.values()]
-        return tuple(_mesh(values, np.concatenate(fans), *which) for which, fans in parts.items())
+        return tuple(_mesh(values, np.concatenate(cuts), *which) for which, cuts in parts.items())
 
 
-def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Material, smooth: bool) -> Mesh:
+def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, used: MtlMaterial, smooth: bool) -> Mesh:
     """The mesh of triangles [T, 3, kinds of values], with the vertices that they use."""
     points, uvs, normals = values
+    material = used.material
     v, vt, vn = np.moveaxis(triangles, -1, 0)
     if material.texture is None and not smooth:
         used = np.zeros(len(points), bool)
         used[v] = True
         new = np.cumsum(used, dtype=np.uint32) - np.uint32(1)  # the vertices used, in their order
         return Mesh(points[used], new[v], material)
+    scale, offset = np.array([used.scale, used.offset], np.float32)
     # Each corner becomes a vertex: a point may have another texture or normal in another triangle
     faces = np.arange(v.size, dtype=np.uint32).reshape(-1, 3)
     return Mesh(
         vertices=points[v.ravel()],
         faces=faces,
         material=material,
-        uvs=None if material.texture is None else uvs[vt.ravel()],
+        uvs=None if material.texture is None else uvs[vt.ravel()] * scale + offset,
         normals=normals[vn.ravel()] if smooth else None,
     )
 

@@ -92,7 +92,7 @@ def test_hundreds_of_python_shapes_load(variant, tmp_path):
     assert len(mi.load_string(cones).shapes()) == count
     each = {"type": "mrt_cone", "apex": [0, 1, 0], "base_center": [0, 0, 0], "segments": 3}
     mi.load_dict({"type": "scene", "group": {"type": "shapegroup"} | {f"c{i}": each for i in range(count)}})
-    assert mrt.render(str(tmp_path / "cones.xml"), aa=1).image.shape == (3, 4, 3)
+    assert mrt.render(str(tmp_path / "cones.xml"), aa=1, integrator="mrt_whitted").image.shape == (3, 4, 3)
     lines = ["mtllib m.mtl", "v 0 0 0", "v 1 0 0", "v 0 1 0"]
     names = [f"m{i}" for i in range(count)]
     (tmp_path / "m.mtl").write_text("".join(f"newmtl {n}\nKd 0.5 0.5 0.{n[1:]}\n" for n in names))
@@ -231,7 +231,7 @@ def test_messages_are_printable_short_and_few(variant, tmp_path):
     with pytest.warns(mrt.MrtWarning) as warned:
         mrt.render(str(model), width=4, height=3, aa=1)
     assert len(warned) == 1
-    assert "and so do 19999 more materials" in str(warned[0].message)
+    assert "19999 more materials" in str(warned[0].message)
     assert str(warned[0].message).isprintable()
 
 

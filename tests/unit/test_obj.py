@@ -17,6 +17,8 @@ from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, SceneError
+from mrt_mitsuba.scene import obj
+from mrt_mitsuba.scene.export import write_xml
 from mrt_mitsuba.scene.model import Camera, Mesh
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL
 from mrt_mitsuba.scene.obj import obj_scene, read_obj
@@ -60,10 +62,59 @@ for face in ("1 2 3", "1/1 2/2 3/3", "1//1 2//1 3//1", "+1 2 3"):
 for e in ("\r\n", "\r", " \t\n", " #\n"):
     geometry(f"{WHOLE}f 1/1/1 2/2/1 3/3/1\n".replace("\n", e), [HALF])
 geometry(SQUARE + "f -4 -3 -2\nv 5 5 5\nf -5 -4 -1", [HALF, [[0, 0, 0], [1, 0, 0], [5, 5, 5]]])
-geometry("o a\ng b\nv 0 0 0 1\nv 1 0 0 1 2 3\nv 1 1 0 1 .1 2 3\nvt .5\nvt 0 0 0\nl 1 2\nf 1 2 3", [HALF])
+geometry("o a\ng b\nv 0 0 0 1\nv 1 0 0 1.0\nv 1 1 0 .1\nvt .5\nvt 0 0 0\nl 1 2\nf 1 2 3", [HALF])
 geometry("\ufeff" + SQUARE + "s off\nf 1 \\\n2 \\\n3\n", [HALF])
 geometry(SQUARE + "f 1 2 3 4\n", [HALF, [[0, 0, 0], [1, 1, 0], [0, 1, 0]]])
 geometry(SQUARE + "f 1 2 3 4 1 2\n", [HALF, *([[0, 0, 0], *ends] for ends in FAN)])
+
+
+ARROW = [(0, 0), (2, 0), (2, 2), (1, 0.2), (0, 2)]
+STAR = [((2 + k % 2) * math.cos(k / 2), (2 + k % 2) * math.sin(k / 2)) for k in range(12)]
+COMB = [(0, 0), (21, 0), *((k / 4, 3 - 2.5 * (k % 2)) for k in range(80, 0, -1))]
+RING = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)]
+polygons = Cases()
+polygons([*ARROW[:2], (0.4, 0.4), (0, 2)], 0.8)
+polygons(ARROW, 2.2)
+polygons([(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)], 5)
+polygons(STAR, None)
+polygons(COMB, None)
+polygons(RING, 12)  # with a hole
+
+
+@pytest.mark.parametrize("turn", range(4))
+@pytest.mark.parametrize(("corners", "area"), polygons)
+def test_faces_that_are_not_convex_are_covered_once(model, corners, area, turn):
+    """Whichever corner is first, in either winding, and in any plane: areas add up, none is turned over."""
+    corners = np.roll(np.array(corners, float), turn, axis=0)
+    expected = 0.5 * np.linalg.det(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)).sum()
+    assert area is None or expected == pytest.approx(area)
+    corners = corners[::-1] if turn % 2 else corners
+    plane = np.linalg.qr(np.random.default_rng(turn).normal(size=(3, 3)))[0]
+    points = np.column_stack([corners, 0 * corners[:, 0]]) @ plane.T + 5
+    lines = [f"v {x} {y} {z}" for x, y, z in points]
+    (mesh,) = model("\n".join([*lines, "f " + " ".join(map(str, range(1, len(points) + 1)))]))
+    assert len(mesh.faces) == len(points) - 2
+    a, b, c = np.moveaxis(triangles(mesh).astype(float), 1, 0)
+    areas = 0.5 * np.cross(b - a, c - a) @ plane[:, 2] * np.linalg.det(plane) * (-1) ** turn
+    assert areas.min() > -1e-5
+    assert areas.sum() == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_face_that_crosses_itself_is_a_warning(model):
+    with pytest.warns(MrtWarning, match="model.obj:6: the face crosses itself"):
+        (mesh,) = model("v 0 0 0\nv 1 1 0\nv 1 0 0\nv 0 1 0\nv .5 2 0\nf 1 2 3 4 5\n")
+    assert len(mesh.faces) == 3
+
+
+def test_lines_that_hold_nothing_and_repeat_cost_little(model, monkeypatch):
+    """20 MB of empty lines, or 200,000 libraries, took minutes."""
+    read: list[object] = []
+    monkeypatch.setattr(obj, "read_mtl", lambda *given, **options: read.append(given) or {})
+    monkeypatch.setattr(
+        obj._Reader, "read", lambda self, block, do=obj._Reader.read: read.append(do(self, block))
+    )
+    model("mtllib model.mtl\n" * 99 + "\n \n# x\ng y\ns 1\n" * 9999 + SQUARE + "f 1 2 3\n", MTL)
+    assert len(read) < 150
 
 
 @pytest.mark.parametrize(("text", "found"), geometry)
@@ -106,14 +157,85 @@ def test_a_mesh_for_each_material_with_its_own_vertices(model):
     assert other.material.ior == 1.1022
 
 
-@pytest.mark.parametrize("name", ["art\\a.png", "art/my a.png", "-s 2 2 -o 0 0 0 -clamp on a.png"])
+@pytest.mark.parametrize("name", ["art\\a.png", "art/my a.png", "b #2.png", '"my a.png"', "my\\ a.png"])
 def test_names_of_files(model, tmp_path, name):
-    file = tmp_path / name.split("on ")[-1].replace("\\", "/")
+    file = tmp_path / name.replace("\\ ", " ").replace("\\", "/").strip('"')
     file.parent.mkdir(exist_ok=True)
     file.write_bytes(b"")
     (tmp_path / "my model.mtl").write_text(PAINTED.replace("picture.png", name))
     (mesh,) = model(USE_PAINTED.replace("model.mtl", "my model.mtl"))
     assert Path(mesh.material.texture) == file
+
+
+placed = Cases()
+placed("", [[0, 0], [1, 0], [1, 1]], (0, 1), "")
+placed("-s 2 3 1", [[0, 0], [2, 0], [2, 3]], (0, 1), "")
+placed("-s -2 -blendu on -clamp off", [[0, 0], [-2, 0], [-2, 1]], (0, 1), "")
+placed(
+    "-o .5 -.25 0 -mm 0.1 .5 -clamp on", [[0.5, -0.25], [1.5, -0.25], [1.5, 0.75]], (0.1, 0.5), "-clamp on"
+)
+placed("-s 2 -o 1 -bm 0.3", [[1, 0], [3, 0], [3, 1]], (0, 1), "-bm 0.3")
+
+
+@pytest.mark.parametrize("convention", ["report", "standard"])
+@pytest.mark.parametrize(("options", "uvs", "range_", "unused"), placed)
+def test_options_of_a_texture(model, tmp_path, options, uvs, range_, unused, convention):
+    """Obeyed, or named in a warning."""
+    Image.new("RGB", (2, 2)).save(tmp_path / "my picture.png")
+    mtl = PAINTED.replace("picture.png", f"{options} my picture.png # x")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        (mesh,) = model(USE_PAINTED, mtl, convention=convention)
+    assert [str(each.message).partition(": ")[2] for each in caught] == [f"{unused} is not used"] * bool(
+        unused
+    )
+    assert_allclose(mesh.uvs[mesh.faces[0]], uvs)
+    assert mesh.material.texture_range == range_
+
+
+@pytest.mark.parametrize("texturing", ["report", "standard"])
+def test_base_and_gain_are_of_the_values_looked_up(tmp_path, texturing):
+    """As stored in the report's texturing, decoded from sRGB in the standard one; also when exported."""
+    Image.new("RGB", (2, 2), (128, 128, 128)).save(tmp_path / "grey.png")
+    value = {"report": 128 / 255, "standard": 0.21586}[texturing]
+    (tmp_path / "a.mtl").write_text("newmtl a\nKs 0 0 0\nmap_Kd -mm 0.1 0.5 grey.png\n")
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{WHOLE}usemtl a\nf 1/1 2/2 3/3 4/4\n")
+    view = {"camera": (0.5, 0.5, 2), "target": (0.5, 0.5, 0), "fov": 20, "light": (0.5, 0.5, 9)}
+    options = {"width": 8, "height": 8, "aa": 1, "aamode": "none"}
+    written = write_xml(tmp_path / "a.obj", tmp_path / "b.xml", texturing=texturing, **view)
+    for scene, more in ((tmp_path / "a.obj", {**view, "texturing": texturing}), (written[-1], {})):
+        albedo = mrt.render(scene, **options, **more, layers=["albedo"]).layers["albedo.R"]
+        assert_allclose(albedo[4, 4], 0.1 + 0.5 * value, rtol=1e-4)
+
+
+named = Cases()
+named("Material #1", "Material #1", True)
+named("Material #1", "Material #2", False)
+named("two words # c", "two words", True)
+named("two words", "two words # comment", True)
+named("red # one", "red #", True)
+named("red", "red #comment", True)
+named("red", "Red", False)
+
+
+@pytest.mark.parametrize(("name", "use", "found"), named)
+def test_names_of_materials(model, name, use, found):
+    text = f"mtllib model.mtl\n{SQUARE}usemtl {use}\nf 1 2 3\nusemtl {use}\nf 1 2 4\n"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        (mesh,) = model(text, f"newmtl {name}\nKd 0.25\nnewmtl other\nKd 1\n")
+    assert (mesh.material.diffuse == (0.25,) * 3) is found
+    said = [str(each.message) for each in caught]
+    assert len(said) == (not found)
+    assert found or f"model.obj:6: no library has the material '{use}'" in said[0]  # where it is used first
+
+
+def test_the_first_library_that_has_a_material_counts(model, tmp_path):
+    for name, value in (("a.mtl", 0.25), ("my b.mtl", 0.5)):
+        (tmp_path / name).write_text(f"newmtl m\nKd {value}\nnewmtl {name[-5]}\nKd {value}\n")
+    face = "usemtl m\nf 1 2 3\nusemtl b\nf 1 3 4\n"
+    first, second = model(f"mtllib a.mtl my b.mtl\n{SQUARE}{face}")
+    assert (first.material.diffuse[0], second.material.diffuse[0]) == (0.25, 0.5)
 
 
 def test_a_texture_is_looked_for_next_to_the_model_before_the_library(model, tmp_path):
@@ -139,14 +261,22 @@ def test_faces_without_coordinates_have_no_texture(model, tmp_path):
 
 
 LOST = "mtllib nowhere.mtl\n" + SQUARE + "usemtl red\nf 1 2 3\n"
-DROPPED = "newmtl painted\nKd 0.5\nillum 2\nd 0.5\nd 1.0\nTf 1 1 1\nmap_bump x.png\n"
-
-
+BLANKS = LOST.replace("nowhere", "no where")
+DROPPED = "newmtl painted\nKd 0.5\nillum 2\nd 0.5\nd 1.0\nTf 1 1 1\nmap_bump x.png\nKe 2 2 2\nKe 0.0 0 0\n"
+EXTRA = SQUARE.replace("1 0\n", "1 0 1 1 1 1\n").replace("0 0\n", "0 0 1 1 1\n") + "t 1 2\nvw 1\nf 1 2 3\n"
 gaps = Cases()
 gaps(USE_PAINTED, PAINTED, "report", ["model.mtl:9: the texture picture.png is missing", "Kd is used"])
 gaps(LOST, None, "report", ["model.obj:1: the material library nowhere.mtl is", "material 'red'"])
-gaps(USE_PAINTED, DROPPED, "standard", ["model.mtl:4: d 0.5 is not used (and so do 1 more statements)"])
-gaps(USE_PAINTED, DROPPED, "report", [])
+gaps(BLANKS, None, "report", ["model.obj:1: the material library no where.mtl is", "material 'red'"])
+for each in ("standard", "report"):
+    gaps(USE_PAINTED, DROPPED, each, ["model.mtl:4: d 0.5 is not used, nor map_bump, Ke"])
+    gaps(
+        EXTRA,
+        None,
+        each,
+        ["1: colours of vertices are not used", "5: the statement 't' is unknown", "; 1 more"],
+    )
+gaps(USE_PAINTED, "newmtl painted\nKd 0.5\nNs 9\nd 1\nKe 0 0 0", "report", [])
 
 
 @pytest.mark.parametrize(("obj", "mtl", "convention", "texts"), gaps)
@@ -157,8 +287,18 @@ def test_what_is_missing_or_dropped_is_a_warning(model, obj, mtl, convention, te
     said = "\n".join(str(each.message) for each in caught)
     assert all(text in said for text in texts)
     assert bool(said) is bool(texts)
+    assert "more libraries" not in said
     assert mesh.material.texture is None
     assert (mesh.material.diffuse == (0.5,) * 3) is (mtl is not None)
+
+
+def test_alpha_of_a_texture_is_a_warning(model, tmp_path):
+    for alpha, kinds in ((255, 0), (9, 1)):
+        Image.new("RGBA", (2, 2), (1, 2, 3, alpha)).save(tmp_path / "picture.png")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model(USE_PAINTED, PAINTED)
+        assert [str(each.message).split()[1] for each in caught] == ["alpha"] * kinds
 
 
 # What files are made of, whole and in pieces
