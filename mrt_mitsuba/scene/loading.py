@@ -21,8 +21,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.interrupts import held
@@ -210,7 +210,11 @@ def _converted(key: str, value: Any, kind: type, name: str) -> Any:
     try:
         if kind in (str, bool, int) and not isinstance(value, kind):
             raise TypeError
-        return kind(value[0] if kind is float and dr.is_array_v(value) else value)
+        if "AffineTransform" in name and hasattr(value, "matrix"):
+            value = value.matrix
+        if kind.__name__.removeprefix("Scalar") in _STATED and hasattr(value, "__array__"):  # of a Dr.Jit variant
+            value = np.array(value).squeeze()
+        return kind(value)
     except (TypeError, ValueError, RuntimeError):
         raise UsageError(f"{key}={value!r}: must be a {name}") from None
 

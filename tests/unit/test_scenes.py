@@ -134,9 +134,9 @@ found({"params": ALL | {"ball.center": [0, 0, 5], "ball.radius": 9}}, 0, 4)
 def test_parameters_of_a_file_and_those_that_it_includes(nested, options, value, rays):
     result = mrt.render(nested, **options)
     assert_allclose(np.median(result.image), value, rtol=1e-6)
-    assert result.plan.passes[0].places.size == rays
+    assert result.plan.passes[0].pattern.size == rays
     (where,) = write_xml(nested, nested.parent / "flat.xml", params=ALL)
-    assert mrt.render(where).plan.passes[0].places.size == 4
+    assert mrt.render(where).plan.passes[0].pattern.size == 4
 
 
 wrong = Cases()
