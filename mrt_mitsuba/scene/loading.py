@@ -212,7 +212,7 @@ def _converted(key: str, value: Any, kind: type, name: str) -> Any:
             raise TypeError
         if "AffineTransform" in name and hasattr(value, "matrix"):
             value = value.matrix
-        if kind.__name__.removeprefix("Scalar") in _STATED and hasattr(value, "__array__"):  # of a Dr.Jit variant
+        if kind.__name__.removeprefix("Scalar") in _STATED and hasattr(value, "__array__"):
             value = np.array(value).squeeze()
         return kind(value)
     except (TypeError, ValueError, RuntimeError):
