@@ -1,9 +1,8 @@
-"""The changes that this package makes in Mitsuba: ``CHANGES`` lists each with its reason. Mitsuba needs them
-since 3.9 at least.
+"""Patches of Mitsuba's functions that make our plugins safe in ``mi.render``, each with its reason.
 
-``make()`` puts the changes into effect, ``undo()`` takes them back; ``mrt.register(guard=False)`` leaves
-them out. Names, signatures and pickles of what is changed stay Mitsuba's. A change is known by the function
-itself, which ``Change`` keeps: what somebody else puts around Mitsuba's functions is not taken for it.
+``apply_patches()`` puts those in ``PATCHES`` into effect, ``undo_patches()`` takes them back;
+``mrt.register(guard=False)`` leaves them out. Names, signatures and pickles of patched functions stay
+Mitsuba's. Mitsuba 3.9 needs them.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, reduce, wraps
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mrt_mitsuba import plugins
-from mrt_mitsuba.interrupts import interrupt_behind
+from mrt_mitsuba.interrupts import defer_signals, interrupt_behind
 from mrt_mitsuba.plugins.whitted.snapshot import updates
 
 Function = Callable[..., Any]
@@ -36,16 +35,17 @@ LARGEST_SEARCHED = 2**26  # bytes
 HINTS = (b"mrt_", b"<include", b"&#", b'type="$', b"type='$", b"\0")
 
 
-class Turn:
-    """A lock that a thread may take several times, and that is free in a process forked by another thread.
+class ForkSafeRLock:
+    """A re-entrant lock that is free in a process forked by another thread.
 
-    Taken by ``with turn.lock``: an interrupt cannot come between taking it and knowing that it must be given
-    back, as it can in a method in Python.
+    Taken by ``with render_lock.lock``: an interrupt cannot come between taking it and noting that it must be
+    released, as it can in a method in Python.
     """
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        os.register_at_fork(after_in_child=self._forked)
+        if hasattr(os, "register_at_fork"):  # not on Windows
+            os.register_at_fork(after_in_child=self._forked)
 
     def _forked(self) -> None:
         if self.lock.acquire(blocking=False):
@@ -54,101 +54,90 @@ class Turn:
             self.lock = threading.RLock()
 
 
-#: taken while Mitsuba is set up, and while it renders what this project made: there, neither it nor Dr.Jit is
-#: safe with several Python threads
-one_at_a_time = Turn()
+#: held while Mitsuba is set up, and while it renders our plugins: there, neither it nor Dr.Jit is safe with
+#: several Python threads
+render_lock = ForkSafeRLock()
 
 
 # ----------------------------------------------- The list ----------------------------------------------
 
 
-class Replacement(NamedTuple):
-    """A function that was put in place of one of Mitsuba's."""
-
-    owner: Any  # the module or class that has it
-    name: str
-    theirs: Function
-    ours: Function
-    inherited: bool  # had the owner the function from a base class
-
-    def undo(self) -> bool:
-        """Take the function back; False where somebody else has put something around it."""
-        alone = getattr(self.owner, self.name) is self.ours
-        if alone and self.inherited:
-            delattr(self.owner, self.name)
-        elif alone:
-            setattr(self.owner, self.name, self.theirs)
-        return alone
-
-
 @dataclass
-class Change:
-    """A function of Mitsuba's that is replaced."""
+class Patch:
+    """A function that replaces one of Mitsuba's."""
 
     where: str  #: as users call it, such as "mi.render"
-    ours: Function  #: what is called in its place: with the function itself, then its arguments
+    replacement: Function  #: called with the original function, then its arguments
     what: str
     why: str
-    made: list[Replacement] = field(default_factory=list)  #: in the variants so far
+    undo_steps: list[Callable[[], None]] = field(default_factory=list)
 
-    def make(self) -> None:
-        """Put our function in place where it is not, in the current variant."""
+    def apply(self) -> None:
+        """Replace the function in the current variant, unless it is replaced already."""
         _, *path, name = self.where.split(".")
         owner = reduce(getattr, path, mi)
-        theirs = getattr(owner, name)
-        own = {id(each.ours) for each in self.made}
-        with contextlib.suppress(ValueError):  # what has itself, or ever more functions, inside of it
-            if id(inspect.unwrap(theirs, stop=lambda function: id(function) in own)) in own:
-                return
+        original = getattr(owner, name)
+        if getattr(original, "mrt_patch", "") == self.where:  # ours, or another's that wraps ours
+            return
 
-        @wraps(theirs)
+        @wraps(original)
         def call(*args: object, **given: object) -> object:
-            return self.ours(theirs, *args, **given) if _in_effect else theirs(*args, **given)
+            return self.replacement(original, *args, **given) if _in_effect else original(*args, **given)
 
+        call.mrt_patch = self.where  # type: ignore[attr-defined]
         with contextlib.suppress(ValueError, TypeError):  # functions in C++ have none
-            call.__signature__ = inspect.signature(theirs)  # type: ignore[attr-defined]
-        owners = [owner]
-        home = sys.modules.get(getattr(theirs, "__module__", None) or "")  # which it is pickled by
-        if inspect.ismodule(owner) and getattr(home, name, None) is theirs:
-            owners.append(home)
-        for each in owners:
-            self.made.append(Replacement(each, name, theirs, call, inherited=name not in vars(each)))
-            setattr(each, name, call)
+            call.__signature__ = inspect.signature(original)  # type: ignore[attr-defined]
+        self._set(owner, name, call)
+        home = sys.modules.get(getattr(original, "__module__", None) or "")  # by which it is pickled
+        if inspect.ismodule(owner) and getattr(home, name, None) is original:
+            self._set(home, name, call)
+
+    def _set(self, owner: Any, name: str, call: Function) -> None:
+        inherited = name not in vars(owner)
+        original = getattr(owner, name)
+
+        def undo() -> None:  # nothing where somebody else has wrapped it since
+            if getattr(owner, name) is call:
+                delattr(owner, name) if inherited else setattr(owner, name, original)
+
+        self.undo_steps.append(undo)
+        setattr(owner, name, call)
 
     def undo(self) -> None:
-        """Take our functions back; those inside of somebody else's only pass calls on."""
-        self.made = [each for each in self.made if not each.undo()]
+        """Restore Mitsuba's functions; a patch that somebody else has wrapped only passes calls on."""
+        while self.undo_steps:
+            self.undo_steps.pop()()
 
 
-CHANGES: list[Change] = []
+PATCHES: list[Patch] = []
 _in_effect = _watching = False
 
 
-def change(where: str, *, what: str, why: str) -> Callable[[Function], Function]:
-    """Put a change into ``CHANGES``, by the function that is called in place of Mitsuba's."""
+def patch(where: str, *, what: str, why: str) -> Callable[[Function], Function]:
+    """Put a patch into ``PATCHES``, by the function that is called in place of Mitsuba's."""
 
-    def add(ours: Function) -> Function:
-        CHANGES.append(Change(where, ours, what, why))
-        return ours
+    def add(replacement: Function) -> Function:
+        PATCHES.append(Patch(where, replacement, what, why))
+        return replacement
 
     return add
 
 
 def _argument(place: int, name: str, args: tuple[Any, ...], given: dict[str, Any]) -> Any:
-    """An argument of one of Mitsuba's functions; None where it is missing, which Mitsuba reports."""
+    """Return an argument of one of Mitsuba's functions; None if it is missing, which Mitsuba reports."""
     return args[place] if place < len(args) else given.get(name)
 
 
-# ------------------------------------------- Rendering in turn -----------------------------------------
+# ------------------------------------------ Renders under a lock ---------------------------------------
 
 
 def of_this_package(thing: object) -> bool:
-    """Whether this package has the class of an object."""
+    """True if this package has the class of an object."""
     return type(thing).__module__.startswith("mrt_mitsuba.")
 
 
-def needs_turn(scene: mi.Scene, integrator: mi.Integrator) -> bool:
-    """Whether a render runs Python code of ours, and none of somebody else's that may wait for it."""
+def needs_lock(scene: mi.Scene, integrator: mi.Integrator) -> bool:
+    """True if a render runs Python code of ours, and no third-party integrator that may wait for it."""
     if of_this_package(integrator):
         return True
     if not plugins.any_constructed() or not isinstance(integrator, mi.Integrator):
@@ -163,18 +152,18 @@ def needs_turn(scene: mi.Scene, integrator: mi.Integrator) -> bool:
     return any(map(of_this_package, direct)) or any(map(of_this_package, mi.traverse(scene).hierarchy))
 
 
-@change(
+@patch(
     "mi.render",
     what="renders scenes with plugins of this project one after the other, and passes Ctrl-C on",
     why="two threads that trace plugins in Python at once end the process; Dr.Jit turns a Ctrl-C in an "
     "integrator in Python into a RuntimeError",
 )
-def render_in_turn(render: Function, /, *args: object, **given: object) -> object:
+def render_under_lock(render: Function, /, *args: object, **given: object) -> object:
     scene = _argument(0, "scene", args, given)
     integrator = _argument(3, "integrator", args, given)
-    if not isinstance(scene, mi.Scene) or not needs_turn(scene, integrator or scene.integrator()):
+    if not isinstance(scene, mi.Scene) or not needs_lock(scene, integrator or scene.integrator()):
         return render(*args, **given)
-    with one_at_a_time.lock:
+    with render_lock.lock:
         try:
             return render(*args, **given)
         except RuntimeError as error:
@@ -183,23 +172,25 @@ def render_in_turn(render: Function, /, *args: object, **given: object) -> objec
             raise
 
 
-@change(
+@patch(
     "mi.SceneParameters.__setitem__",
     what="waits while such a scene is rendered",
     why="a change in the midst of a render ends the process",
 )
-def set_in_turn(setitem: Function, /, *args: object, **given: object) -> object:
-    with one_at_a_time.lock:
+def set_under_lock(setitem: Function, /, *args: object, **given: object) -> object:
+    with render_lock.lock:
         return setitem(*args, **given)
 
 
-@change(
+@patch(
     "mi.SceneParameters.update",
     what="waits while such a scene is rendered, and notes what was updated",
-    why="numbers may have been written where they lie, which no array shows",
+    why="NumPy views can modify arrays in place, undetected",
 )
-def update_in_turn(update: Function, /, *args: object, **given: object) -> list[tuple[mi.Object, set[str]]]:
-    with one_at_a_time.lock:
+def update_under_lock(
+    update: Function, /, *args: object, **given: object
+) -> list[tuple[mi.Object, set[str]]]:
+    with render_lock.lock:
         updated = update(*args, **given)
         parameters = _argument(0, "self", args, given)
         changed = dict(updated) if plugins.any_constructed() else {}
@@ -213,42 +204,8 @@ def update_in_turn(update: Function, /, *args: object, **given: object) -> list[
 # ----------------------------------------------- Loading -----------------------------------------------
 
 
-class TwoThreads:
-    """Lets Dr.Jit have two threads at least: with one, Mitsuba waits for the EXR files it reads for ever.
-
-    Blocks may overlap: one that needs a second thread sets it, and the last that leaves takes it back.
-    """
-
-    def __init__(self) -> None:
-        self._forget()
-        os.register_at_fork(after_in_child=self._forget)
-
-    def _forget(self) -> None:
-        self._lock = threading.Lock()
-        self._blocks = 0  # that have been entered and not left
-        self._raised = False
-
-    def __enter__(self) -> None:
-        with self._lock:
-            self._blocks += 1
-            if dr.thread_count() == 1:
-                self._raised = True
-                dr.set_thread_count(2)
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._blocks -= 1
-            if self._blocks == 0 and self._raised:
-                self._raised = False
-                if dr.thread_count() == 2:
-                    dr.set_thread_count(1)
-
-
-two_threads = TwoThreads()
-
-
 def dict_is_ours(scene: object) -> bool:
-    """Whether a dict has a plugin of ours."""
+    """True if a dict has a plugin of ours."""
     waiting = [scene]
     seen = set[int]()  # a dict may lie in itself
     while waiting:
@@ -262,12 +219,12 @@ def dict_is_ours(scene: object) -> bool:
 
 
 def text_is_ours(text: object) -> bool:
-    """Whether XML may have a plugin of ours."""
+    """True if XML may have a plugin of ours."""
     return isinstance(text, str) and any(hint.decode() in text for hint in HINTS)
 
 
 def file_is_ours(path: Any) -> bool:
-    """Whether an XML file may have a plugin of ours."""
+    """True if an XML file may have a plugin of ours."""
     # Mitsuba itself reports what cannot be read. What is no file, such as a pipe, can be read only once
     with contextlib.suppress(OSError, ValueError, TypeError):
         name = str(mi.file_resolver().resolve(os.fspath(path)))
@@ -280,35 +237,36 @@ def file_is_ours(path: Any) -> bool:
     return False
 
 
-def _loading(where: str, source: str, is_ours: Callable[[Any], bool]) -> Change:
-    """The change of a loader, whose first parameter is ``source``."""
+def _loading(where: str, source: str, is_ours: Callable[[Any], bool]) -> Patch:
+    """Return the patch of a loader, whose first parameter is ``source``."""
 
-    def load_in_turn(load: Function, /, *args: object, **given: object) -> object:
-        if len(args) < 2 and "parallel" not in given:
-            values = [value for name, value in given.items() if name not in (source, "optimize")]
-            parameters_are_ours = any("mrt_" in str(value) for value in values)
-            if parameters_are_ours or is_ours(_argument(0, source, args, given)):
-                given["parallel"] = False
-        with two_threads:
+    def load_serially(load: Function, /, *args: object, **given: object) -> object:
+        values = [value for name, value in given.items() if name not in (source, "optimize", "parallel")]
+        ours = any("mrt_" in str(value) for value in values) or is_ours(_argument(0, source, args, given))
+        if ours and len(args) < 2:
+            given.setdefault("parallel", False)
+        with defer_signals() if ours else contextlib.nullcontext():
             return load(*args, **given)
 
-    return Change(
+    return Patch(
         where,
-        load_in_turn,
-        what="loads scenes with plugins of this project one object at a time, unless parallel= is given",
-        why="Mitsuba's parallel loader overflows the stack, or crashes, with hundreds of objects in Python",
+        load_serially,
+        what="loads scenes with plugins of this project one object at a time, unless parallel= is given, and "
+        "raises Ctrl-C afterwards",
+        why="Mitsuba's parallel loader overflows the stack, or crashes, with hundreds of objects in Python, "
+        "and turns a Ctrl-C in one into a RuntimeError",
     )
 
 
-CHANGES.append(_loading("mi.load_dict", "dict", dict_is_ours))
-CHANGES.append(_loading("mi.load_string", "value", text_is_ours))
-CHANGES.append(_loading("mi.load_file", "path", file_is_ours))
+PATCHES.append(_loading("mi.load_dict", "dict", dict_is_ours))
+PATCHES.append(_loading("mi.load_string", "value", text_is_ours))
+PATCHES.append(_loading("mi.load_file", "path", file_is_ours))
 
 
 # -------------------------------------------- Light tracing --------------------------------------------
 
 
-@change(
+@patch(
     "mi.AdjointIntegrator.render",
     what="refuses scenes with mrt_light",
     why="the light cannot do so itself: Dr.Jit calls its methods for scenes that have none, too",
@@ -330,23 +288,23 @@ def refuse_light_tracing(render: Function, /, *args: object, **given: object) ->
 # --------------------------------------------- Putting in effect ---------------------------------------
 
 
-def make() -> None:
-    """Put all changes into effect, also in variants that are switched to later. Idempotent."""
+def apply_patches() -> None:
+    """Put all patches into effect, also in variants that are switched to later. Idempotent."""
     global _in_effect, _watching
     _in_effect = True
     if not _watching:
         _watching = True
-        mi.detail.add_variant_callback(lambda old, new: make() if _in_effect else None)
-    for change in CHANGES:
-        change.make()
+        mi.detail.add_variant_callback(lambda old, new: apply_patches() if _in_effect else None)
+    for each in PATCHES:
+        each.apply()
 
 
-def undo() -> None:
-    """Take all changes back, in all variants."""
+def undo_patches() -> None:
+    """Take all patches back, in all variants."""
     global _in_effect
     _in_effect = False
-    for change in CHANGES:
-        change.undo()
+    for each in PATCHES:
+        each.undo()
 
 
 # --------------------------------------------- While it starts -----------------------------------------
@@ -354,9 +312,9 @@ def undo() -> None:
 
 @contextlib.contextmanager
 def rewriting_later() -> Iterator[None]:
-    """Let functions under ``@dr.syntax`` be rewritten when they are first called.
+    """Postpone ``@dr.syntax`` within the block until the decorated functions are first called.
 
-    Mitsuba has ten of them, in integrators for derivatives; to rewrite them takes 60 ms of each start.
+    Mitsuba has ten of them, in integrators for derivatives; rewriting them takes 60 ms of each start.
     """
     rewrite = dr.syntax
 
@@ -382,7 +340,7 @@ def rewriting_later() -> Iterator[None]:
 
 
 def mitsuba_first(folder: str | None = None) -> None:
-    """Let Mitsuba find its own plugins before files of their names in ``folder`` and others."""
+    """Make Mitsuba search its own folder for plugins before ``folder`` and all others."""
     current = mi.file_resolver()
     others = [str(current[i]) for i in range(len(current))]
     resolver = mi.FileResolver()
@@ -394,5 +352,5 @@ def mitsuba_first(folder: str | None = None) -> None:
 
 @cache
 def mitsuba_home() -> str:
-    """The folder in which Mitsuba is installed."""
+    """Return the folder in which Mitsuba is installed."""
     return os.path.dirname(os.path.abspath(mi.__file__))

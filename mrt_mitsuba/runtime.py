@@ -12,9 +12,9 @@ import mitsuba as mi
 
 from mrt_mitsuba import llvm, mitsuba_changes, plugins
 from mrt_mitsuba.errors import UnknownVariantError, VariantError, warn
-from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.machine import usable_cores
-from mrt_mitsuba.mitsuba_changes import one_at_a_time
+from mrt_mitsuba.mitsuba_changes import render_lock
 
 FAST = "llvm_ad_rgb"
 SLOW = "scalar_rgb"
@@ -37,7 +37,7 @@ def use(variant: str | None = None) -> str:
     if _used and variant in (None, _used) and mi.variant() == _used:
         return _used
     quickly = mitsuba_changes.rewriting_later() if _guard else contextlib.nullcontext()
-    with one_at_a_time.lock, held(), quickly:
+    with render_lock.lock, defer_signals(), quickly:
         if variant is None:
             variant = mi.variant() or default_variant()
         elif variant not in mi.variants():
@@ -49,12 +49,13 @@ def use(variant: str | None = None) -> str:
             raise VariantError(f"the variant {variant} cannot be used: {problem}")
         if mi.variant() != variant:
             mi.set_variant(variant)
-            # Dr.Jit does not look at quotas of control groups; two at least, see ``TwoThreads``
+            # Dr.Jit does not look at quotas of control groups; two at least: Mitsuba 3.9 reads EXR
+            # files in a second thread, and deadlocks without one
             if dr.thread_count() > (threads := max(usable_cores(), 2)):
                 dr.set_thread_count(threads)
         if _guard:
             mitsuba_changes.mitsuba_first()
-            mitsuba_changes.make()
+            mitsuba_changes.apply_patches()
         plugins.register()
         plugins.register_modules("mrt_mitsuba.adaptive", ["samplers", "integrator"])
         _used = variant
@@ -77,7 +78,7 @@ def register(guard: bool = True) -> None:
 
     They follow every later switch of the variant. Where no variant is set yet, the default one is.
 
-    ``guard``: change what ``mrt_mitsuba.mitsuba_changes.CHANGES`` lists in how Mitsuba loads, renders and
+    ``guard``: apply the patches in ``mrt_mitsuba.mitsuba_changes.PATCHES`` to how Mitsuba loads, renders and
     updates, for scenes with these plugins. With False, nothing of Mitsuba is changed, and earlier changes are
     taken back, until the next ``register()``: then such scenes must be loaded with ``parallel=False`` and
     used by one thread, and numbers that are written where they lie are not noticed.
@@ -86,7 +87,7 @@ def register(guard: bool = True) -> None:
     _used = None  # also where a caller has taken them out since
     _guard = guard
     if not guard:
-        mitsuba_changes.undo()
+        mitsuba_changes.undo_patches()
     use()
 
 

@@ -16,11 +16,9 @@ from mrt_mitsuba import __version__
 from mrt_mitsuba.command.options import parse
 from mrt_mitsuba.command.registry import HELP, commands, run
 from mrt_mitsuba.errors import MrtError, UsageError, escaped, needs_extra, one_line
-from mrt_mitsuba.files.replacing import discard_unfinished
-from mrt_mitsuba.interrupts import Terminated, ending_soon, leave_now
+from mrt_mitsuba.interrupts import interrupt_behind, leave_now
 
 INTERRUPTED = 128 + signal.SIGINT
-TERMINATED = 128 + signal.SIGTERM
 # What printing fails with where nobody reads, or the disk is full; pictures have errors of their own
 UNPRINTED = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 # An environment variable; set to anything, unexpected errors show where they came from
@@ -59,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if problem:
             print(f"mrt: {one_line(problem)}", file=sys.stderr)
     picture = bool(words) and words[0] not in commands()
-    if arguments is None and (picture or code in (INTERRUPTED, TERMINATED)):
+    if arguments is None and (picture or code == INTERRUPTED):
         # the interpreter would wait for kernels that run, and take apart all that it has loaded
         leave_now(code)
     return code
@@ -68,19 +66,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _guarded(words: list[str]) -> tuple[int, str]:
     """Run the command; return its exit code, and what went wrong."""
     try:
-        with ending_soon(_end_by_force), needs_extra():
+        with needs_extra():
             code = _dispatch(words)
             sys.stdout.flush()
         return code, ""
     except MrtError as error:
         return error.exit_code, str(error)
-    except Terminated:
-        return TERMINATED, "terminated"
     except KeyboardInterrupt:
         return INTERRUPTED, "interrupted"
     except MemoryError:
         return 1, "out of memory: choose a smaller width, height or aa"
     except Exception as error:
+        if interrupt_behind(error):
+            return INTERRUPTED, "interrupted"
         if isinstance(error, OSError) and error.errno in UNPRINTED and error.filename is None:
             # or Python complains once more at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -115,16 +113,6 @@ def _dispatch(words: list[str]) -> int:
     from mrt_mitsuba.command import render
 
     return render.run(options)
-
-
-def _end_by_force() -> None:
-    if psutil := sys.modules.get("psutil"):  # Dask has loaded it: workers of a sweep would stay
-        for worker in psutil.Process().children(recursive=True):
-            with contextlib.suppress(psutil.Error):
-                worker.kill()
-    discard_unfinished()
-    newline = "\n" if sys.stderr.isatty() else ""  # below the progress bar
-    print(f"{newline}mrt: interrupted", file=sys.stderr)
 
 
 if __name__ == "__main__":

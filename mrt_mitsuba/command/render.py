@@ -13,7 +13,7 @@ from mrt_mitsuba.command.options import LEVELS, Options
 from mrt_mitsuba.command.registry import import_plugins
 from mrt_mitsuba.errors import MrtWarning, printable
 from mrt_mitsuba.files.replacing import check_target
-from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.machine import check_start
 from mrt_mitsuba.options import is_obj
 from mrt_mitsuba.rendering.settings import AA, AAMODE, NOISE
@@ -37,7 +37,7 @@ def run(options: Options) -> int:
         warnings.simplefilter("ignore", MrtWarning)
     else:
         print(banner(options), flush=True)
-    with held():
+    with defer_signals():
         from mrt_mitsuba import runtime
 
         runtime.use(options.variant)

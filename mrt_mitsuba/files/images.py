@@ -15,7 +15,7 @@ from typing import IO, TYPE_CHECKING, Any
 from mrt_mitsuba.errors import OutputError, UsageError, warn
 from mrt_mitsuba.files.layers import LAYERS
 from mrt_mitsuba.files.replacing import replacing
-from mrt_mitsuba.interrupts import heed, held
+from mrt_mitsuba.interrupts import defer_signals, deliver_pending
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.options import StrPath, Values, check, choice
 
@@ -152,7 +152,7 @@ def _write_exr(
         def run(*arguments: Any) -> int:
             if not raised:
                 try:
-                    heed()
+                    deliver_pending()
                     return call(*arguments)
                 except BaseException as error:
                     raised.append(error)
@@ -165,7 +165,7 @@ def _write_exr(
     # A stream in Python, as the library does not report a full disk when it opens the file itself
     methods = {name: remembering(getattr(file, name), name == "write") for name in ("tell", "seek", "write")}
     kind = OpenEXR.ZIP_COMPRESSION if compression == "zip" else OpenEXR.NO_COMPRESSION
-    with held(), exr_threads():
+    with defer_signals(), exr_threads():
         try:
             exr = OpenEXR.File({**attributes, "compression": kind, "type": OpenEXR.scanlineimage}, planes)
             exr.write(SimpleNamespace(**methods))

@@ -8,26 +8,22 @@ is removed by the next one that writes to the folder: a lock says whether its wr
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
 import os
-import shutil
 import stat
-import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
 
 from mrt_mitsuba.errors import OutputError
-from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.options import StrPath
 
 log = logging.getLogger(__name__)
 
 _TEMPORARY = ".mrt-{}.tmp"
 _OLD = 10.0  # seconds after which a file that nobody has locked was left over
-unfinished: set[str] = set()  #: temporary files and folders of this process
 _tidied: set[str] = set()  # folders
 
 
@@ -63,31 +59,11 @@ def replacing(*paths: StrPath, inputs: Iterable[StrPath] = ()) -> Iterator[list[
                 os.fsync(file.fileno())
                 if os.path.exists(target):
                     os.fchmod(file.fileno(), stat.S_IMODE(os.stat(target).st_mode))
-            with held():  # an interrupt in between is raised afterwards
+            with defer_signals():  # an interrupt in between is raised afterwards
                 for file, target in zip(files, targets, strict=True):
                     os.replace(file.name, target)
     for target in targets:
         log.info("wrote %s", target)
-
-
-def discard_unfinished() -> None:
-    """Remove the temporary files and folders of this process, which is about to be ended by force."""
-    for temporary in tuple(unfinished):
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def temporary_folder(folder: StrPath, prefix: str) -> Iterator[str]:
-    """Give a new folder in another, removed at the end; its name begins with ``prefix``."""
-    name = tempfile.mkdtemp(prefix=prefix, dir=folder)
-    unfinished.add(name)
-    try:
-        yield name
-    finally:
-        shutil.rmtree(name, ignore_errors=True)
-        unfinished.discard(name)
 
 
 @contextlib.contextmanager
@@ -146,15 +122,14 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
                 state = left.lstat()
                 if stat.S_ISREG(state.st_mode) and time.time() - state.st_mtime > _OLD:
                     with left.open("rb") as file:
-                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises while its writer lives
+                        _lock(file)  # raises while its writer lives
                         left.unlink()
     name = os.path.join(folder, _TEMPORARY.format(os.urandom(8).hex()))
-    unfinished.add(name)
     try:
         new = open(name, "x+b")  # noqa: SIM115 - closing it may fail
         try:
             with contextlib.suppress(OSError):  # not every file system can
-                fcntl.flock(new, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _lock(new)
             yield new
         finally:
             with contextlib.suppress(OSError):  # a full disk has no room for the rest
@@ -162,4 +137,11 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
     finally:
         with contextlib.suppress(OSError):
             os.unlink(name)
-        unfinished.discard(name)
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Lock a file; raises ``OSError`` if another process has it, or the file system has no locks."""
+    if os.name == "posix":
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -24,7 +24,7 @@ from mrt_mitsuba.errors import UsageError, printable
 from mrt_mitsuba.files import images
 from mrt_mitsuba.files.layers import AVERAGED
 from mrt_mitsuba.files.layers import TABLE as LAYER_TABLE
-from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.machine import Budget, Workspace
 from mrt_mitsuba.options import Values
 from mrt_mitsuba.rendering.exposing import FILM_PREFIX
@@ -207,7 +207,7 @@ def refuse_freezing() -> None:
 def session(settings: RenderSettings) -> Iterator[Job]:
     """Let one render run alone, in the variant that the settings name, and measure what it costs."""
     refuse_freezing()
-    with runtime.one_at_a_time.lock, held(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    with runtime.render_lock.lock, defer_signals(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         budget = Budget.of(settings.memory)
         job = Job(settings.progress or default_progress(), budget, settings.on_round)
@@ -238,7 +238,7 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
     with sized(source):  # before the shader, whose film has this size
         shader = Shader(source, settings.motion)
         plan = make_plan(source, shader, settings)
-        workspace = Workspace.next_to(
+        workspace = Workspace.from_budget(
             plan.padded_region.width,
             plan.padded_region.height,
             plan.channels,

@@ -21,7 +21,7 @@ import numpy as np
 
 from mrt_mitsuba.files.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.filters.grid import dilated
-from mrt_mitsuba.interrupts import heed
+from mrt_mitsuba.interrupts import deliver_pending
 from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY
 from mrt_mitsuba.rendering.canvas import Canvas
 from mrt_mitsuba.rendering.film import Film, SamplePattern, divide, opaque
@@ -312,8 +312,8 @@ class Exposer:
             del values  # which would take room, as these would, next to the next wavefront
             advance(part.stop - part.start)
         workspace = self.job.workspace
-        most = max(workspace.rays_at_once(channels), groups.size)
-        workspace.give_back(min(most, groups.rays) * channels * BYTES_PER_CHANNEL_OF_RAY)
+        most = max(workspace.wavefront_size(channels), groups.size)
+        workspace.flush_cache(min(most, groups.rays) * channels * BYTES_PER_CHANNEL_OF_RAY)
 
     def expose(
         self,
@@ -342,7 +342,7 @@ class Exposer:
         film, and their values.
         """
         width = self.film.width if self.film else self.shader.width
-        most = self.job.workspace.rays_at_once(channels)
+        most = self.job.workspace.wavefront_size(channels)
         # the random numbers of Mitsuba's samplers depend on the cuts, which time must not decide
         rays = most if self.film is not None and not self.film.independent else min(most, WAVEFRONT)
         start = time.perf_counter()
@@ -351,7 +351,7 @@ class Exposer:
             return max(1, rays // groups.size)
 
         for part, some in groups.parts(limit, width):
-            heed()
+            deliver_pending()
             place: Any
             values: Values
             if mi.variant().startswith("scalar"):
@@ -385,7 +385,7 @@ class Exposer:
             )
             for number in range(first, first + groups.size * count):
                 place, traced = self.trace(int(pixel), number, samples, groups.first_group)
-                heed()
+                deliver_pending()
                 places.append((0, 0) if place is None else (place.x, place.y))
                 values.append(traced)
         return np.array(places).T, list(np.array(values).T)

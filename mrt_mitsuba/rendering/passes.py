@@ -249,13 +249,13 @@ class Passes:
         """
         height = self._plan.padded_region.height
         width = self._plan.padded_region.width
-        most = self._job.workspace.rows_at_once(width)
+        most = self._job.workspace.band_rows(width)
         step = height if height <= most else max(most - 2 * halo, halo, 1)
         for start in range(0, height, step):
             stop = min(start + step, height)
             top = max(start - halo, 0)
             yield slice(start, stop), slice(top, min(stop + halo, height)), slice(start - top, stop - top)
-        self._job.workspace.give_back(min(most, height) * width * BYTES_PER_PIXEL_OF_FILTER)
+        self._job.workspace.flush_cache(min(most, height) * width * BYTES_PER_PIXEL_OF_FILTER)
 
     def _layer(self, name: str) -> np.ndarray:
         """Return a layer, of zeros if it is new; all but the picture in planes, as an EXR has them."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.plugins.whitted.snapshot import Part
 from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
 from mrt_mitsuba.rendering.exposing import Exposer
@@ -40,7 +40,7 @@ class Prepared:
     def __init__(self, scene: Any, options: RenderOptions) -> None:
         self._scene = scene
         self._settings = RenderSettings.of(**options)
-        with runtime.one_at_a_time.lock, held():
+        with runtime.render_lock.lock, defer_signals():
             self._render(self._settings.seed)
             self._film_window = _window(self._source.sensor.film())
             self.params = mi.traverse(self._source.scene)
@@ -49,7 +49,7 @@ class Prepared:
     def __call__(self, seed: int = 0) -> Result:
         """Render the scene as it is now; ``seed`` is of all random numbers."""
         refuse_freezing()
-        with runtime.one_at_a_time.lock, held(), runtime.within(self._made.plan.variant):
+        with runtime.render_lock.lock, defer_signals(), runtime.within(self._made.plan.variant):
             self.params.update()
             self._resize()
             if self._launch is None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TextIO
 
-from mrt_mitsuba.interrupts import heed
+from mrt_mitsuba.interrupts import deliver_pending
 from mrt_mitsuba.machine import Budget, Workspace
 
 if TYPE_CHECKING:
@@ -208,7 +208,7 @@ class Job:
 
             def advance_and_collect(steps: int) -> None:
                 advance(steps)
-                heed()
+                deliver_pending()
                 if time.perf_counter() - self._collected > SECONDS:
                     self.collect()
 

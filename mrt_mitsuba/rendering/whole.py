@@ -25,7 +25,7 @@ def whole_pictures(
             f"the integrator {shader.name} gives whole pictures, which this film keeps as "
             f"{', '.join(film.bands)}: use an hdrfilm"
         )
-    most = max(1, job.workspace.rays_at_once(len(exposer.names)) // film.pixels)
+    most = max(1, job.workspace.wavefront_size(len(exposer.names)) // film.pixels)
     for done in range(0, rays, most):
         count = film.rays_near(min(most, rays - done))
         try:

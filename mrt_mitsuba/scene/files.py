@@ -93,27 +93,6 @@ def has_alpha(path: StrPath) -> bool:
         return False
 
 
-def picture_size(path: str) -> tuple[int, int] | None:
-    """Width and height of a picture, by its header alone; None if that does not say."""
-    import OpenEXR
-    from PIL import Image
-
-    try:
-        with open(path, "rb") as file:
-            if file.read(4) == b"\x76\x2f\x31\x01":
-                low, high = OpenEXR.File(path, header_only=True).header()["dataWindow"]
-                return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
-        limit = Image.MAX_IMAGE_PIXELS
-        Image.MAX_IMAGE_PIXELS = None
-        try:
-            with Image.open(path) as picture:
-                return picture.size
-        finally:
-            Image.MAX_IMAGE_PIXELS = limit
-    except Exception:  # whatever libraries raise on broken files; reading the pixels reports it
-        return None
-
-
 def warn_of(findings: Mapping[str, list[str]]) -> None:
     """Warn of findings, by kind in the plural: of the first, with the number of the others."""
     for kind, texts in findings.items():

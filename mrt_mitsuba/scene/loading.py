@@ -25,17 +25,16 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
-from mrt_mitsuba.interrupts import held
+from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.machine import Budget
-from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home, two_threads
+from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home
 from mrt_mitsuba.options import Values
-from mrt_mitsuba.scene.files import DEEPEST, elements, picture_size, require_file
+from mrt_mitsuba.scene.files import DEEPEST, elements, require_file
 
 DEEPEST_INCLUDE = 15  # files that include each other; Mitsuba refuses more
 MOST_INCLUDES = 1000
 LONGEST_SUBSTITUTION = 2**24  # characters that parameters of a file come to in all
 MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
-_PICTURES = ("mrt_texture", "bitmap", "envmap")  # plugins that read one
 
 # A traceback, all indented except its first line, with the type of this project's error; and the place in
 # Mitsuba's own sources where an error was raised
@@ -122,10 +121,7 @@ def _check_nodes(nodes: Iterable[mi.parser.SceneNode], budget: Budget) -> None:
         if isinstance(samples, int) and not 1 <= samples <= MOST_SAMPLES:
             raise RuntimeError(f"{kind}: sample_count is {samples}; give 1 to {MOST_SAMPLES}")
         if isinstance(filename, str):
-            file = _check_data(filename, budget.inputs)
-            size = picture_size(file) if kind in _PICTURES else None
-            if size:
-                budget.take_texture(file, *size, around=kind == "envmap")
+            _check_data(filename, budget.inputs)
 
 
 def _instantiate(state: mi.parser.ParserState, merge: bool, keys: Values) -> mi.Object:
@@ -137,7 +133,7 @@ def _instantiate(state: mi.parser.ParserState, merge: bool, keys: Values) -> mi.
     config.parallel = False
     config.merge_meshes = merge
     mi.parser.transform_all(config, state)
-    with two_threads, held():  # an interrupt would leave plugins half made, and later renders would crash
+    with defer_signals():  # an interrupt would leave plugins half made, and later renders would crash
         loaded = mi.parser.instantiate(config, state)
     set_parameters(loaded, unset, stated)
     return loaded

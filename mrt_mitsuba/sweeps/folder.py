@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterator
 
 from mrt_mitsuba.errors import OutputError, warn
-from mrt_mitsuba.files.replacing import unfinished
 
 LOCK = ".mrt-sweep.lock"
 
@@ -32,13 +31,11 @@ def reserved(folder: str) -> Iterator[None]:
         raise OutputError(f"cannot write to the folder {folder}: {reason}") from None
     except OSError as error:
         raise OutputError(f"cannot write to the folder {folder}: {error.strerror or error}") from error
-    unfinished.add(path)
     try:
         yield
     finally:
         with contextlib.suppress(OSError):
             os.unlink(path)  # while it is locked: who waits for it sees that it is no longer in its place
-        unfinished.discard(path)
         os.close(file)
 
 

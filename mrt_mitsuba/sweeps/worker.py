@@ -54,14 +54,14 @@ def render_job(
     worker = get_worker()
     facts: Facts = {"worker": worker.address}
     try:
-        with runtime.one_at_a_time.lock:
+        with runtime.render_lock.lock:
             here = describe(folder)
             if here["versions"] != versions:
                 raise MrtError(f"the worker has {here['versions']}; the sweep began with {versions}")
             if working_folder:
                 os.chdir(working_folder)
             user_plugins.load(plugins)
-            threads = max(1, usable_cores() // sharing.get(here["cores"], 1))
+            threads = max(2, usable_cores() // sharing.get(here["cores"], 1))
             facts |= _render(decode(data), folder, png, threads, worker.memory_manager.memory_limit)
     except MrtError as error:
         facts["error"] = str(error)

@@ -127,7 +127,7 @@ def test_the_brightest_ray_of_a_pixel_is_known_however_wavefronts_are_cut(monkey
     options = {"integrator": noise(rare=0.005), "aamode": "noise", "spp": 128, "seed": 1}
     scene = camera(6, 4)
     whole = mrt.render(scene, **options)
-    monkeypatch.setattr(Workspace, "rays_at_once", lambda self, channels: 20)
+    monkeypatch.setattr(Workspace, "wavefront_size", lambda self, channels: 20)
     parts = mrt.render(scene, **options)
     assert parts.kernel_launches > 2 * whole.kernel_launches
     assert whole.error.tail > 0.3

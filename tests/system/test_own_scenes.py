@@ -313,7 +313,7 @@ def test_rays_go_where_the_noise_is():
 def test_wavefronts_do_not_change_a_bit(monkeypatch, name, options):
     scene = _load(name)
     whole = mrt.render(scene, **options)
-    monkeypatch.setattr(Workspace, "rays_at_once", lambda self, channels: 8000)  # more than those of a row
+    monkeypatch.setattr(Workspace, "wavefront_size", lambda self, channels: 8000)  # more than those of a row
     parts = mrt.render(scene, **options)
     assert parts.kernel_launches > whole.kernel_launches
     assert np.array_equal(parts.image, whole.image)

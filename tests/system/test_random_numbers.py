@@ -56,7 +56,7 @@ passes({**REFINED, "spp": 4, "sampler": "multijitter"}, name="film, refined, jit
 @pytest.mark.parametrize("options", passes)
 def test_no_two_rays_draw_the_same(options, at_once, monkeypatch):
     """Of some thousand rays, two have the same 48 bits by chance once in ten million renders."""
-    monkeypatch.setattr(Workspace, "rays_at_once", lambda self, channels: at_once)
+    monkeypatch.setattr(Workspace, "wavefront_size", lambda self, channels: at_once)
     nodes = mrt.scene_dict(0, **SIZE)
     nodes["sensor"]["sampler"] = {"type": options.get("sampler", "independent"), "sample_count": 4}
     integrator = recorder()
@@ -78,7 +78,7 @@ def test_no_two_rays_draw_the_same(options, at_once, monkeypatch):
 )
 def test_no_two_seeds_draw_the_same(options, monkeypatch):
     """Seeds that follow each other, in all of their frames and passes; 48 bits as above."""
-    monkeypatch.setattr(Workspace, "rays_at_once", lambda self, channels: 500)
+    monkeypatch.setattr(Workspace, "wavefront_size", lambda self, channels: 500)
     nodes = mrt.scene_dict(0, **SIZE)
     nodes["sensor"]["sampler"] = {"type": options.get("sampler", "independent"), "sample_count": 4}
     scene = mi.load_dict(nodes)
@@ -112,7 +112,7 @@ def test_parts_of_a_whole_picture_draw_numbers_of_their_own(monkeypatch):
     scene = mi.load_dict(box)
     options = {"integrator": "ptracer", "aamode": "none", "seed": 3}
     few = mrt.render(scene, spp=8, **options)
-    monkeypatch.setattr(Workspace, "rays_at_once", lambda self, channels: few.rays["primary"])
+    monkeypatch.setattr(Workspace, "wavefront_size", lambda self, channels: few.rays["primary"])
     many = mrt.render(scene, spp=16, **options)
     assert many.rays["primary"] == 2 * few.rays["primary"]
     assert not np.allclose(many.image, few.image, rtol=1e-4)

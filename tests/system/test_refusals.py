@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import math
 import os
 import re
@@ -181,18 +180,10 @@ misused("sweep out a.toml", "material_0.alpha is an empty list", empty_axis)
 NAMED = "<string name='filename' value='{}'/>"
 TEXTURED = "<shape type='sphere'><bsdf type='{}'><texture name='{}' type='{}'>{}</texture></bsdf></shape>"
 PIPES = {"in": None, "pipe": PIPE, "in/spectrum": PIPE}
-BLACK = io.BytesIO()  # 6 kB, and 0.7 GB of texels at work
-Image.new("1", (4000, 4000)).save(BLACK, "PNG")
-LARGE_TEXTURE = {"b.png": BLACK.getvalue()}
 
 
 def unending(inside: str) -> None:
     refused("out scene=a.xml", "not a regular file", xml(inside.format("pipe")) | PIPES)
-
-
-def too_large(inside: str) -> None:
-    says = "b.png of 4000x4000 texels, "
-    misused("out scene=a.xml memory=64M", says, xml(inside.format("b.png")) | LARGE_TEXTURE)
 
 
 unending("<include filename='{}'/>")
@@ -204,7 +195,6 @@ unending(f"<path value='in'/>{SPECTRUM.replace('s.spd', 'spectrum')}")
 for bsdf, parameter in (("mrt_bsdf", "diffuse_reflectance"), ("diffuse", "reflectance")):
     for kind in ("mrt_texture", "bitmap"):
         unending(TEXTURED.format(bsdf, parameter, kind, NAMED))
-        too_large(TEXTURED.format(bsdf, parameter, kind, NAMED))
 
 
 def put(path: Path, content: Content) -> None:

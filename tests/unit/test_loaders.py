@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import threading
-from contextlib import ExitStack
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from nodes import scene_xml, sensor
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
-from mrt_mitsuba.mitsuba_changes import two_threads
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -45,36 +42,6 @@ def test_files_that_may_have_our_plugins_are_not_loaded_in_parallel(inside, para
     assert asked == [parallel]
 
 
-LOADED = {"load_dict": {"type": "scene"}, "load_string": scene_xml("")}
-
-
-@pytest.mark.parametrize("name", LOADED)
-def test_loading_leaves_as_many_threads_as_there_were(name):
-    before = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        getattr(mi, name)(LOADED[name])
-        assert dr.thread_count() == 1
-    finally:
-        dr.set_thread_count(before)
-
-
-def test_the_last_of_overlapping_loads_takes_the_second_thread_back():
-    """Two threads of Python may load at once, and the first to be done leaves the other its threads."""
-    before = dr.thread_count()
-    first, second = ExitStack(), ExitStack()
-    dr.set_thread_count(1)
-    try:
-        first.enter_context(two_threads)
-        second.enter_context(two_threads)
-        first.close()
-        assert dr.thread_count() == 2
-        second.close()
-        assert dr.thread_count() == 1
-    finally:
-        dr.set_thread_count(before)
-
-
 def change(parameters: Any) -> None:
     parameters["radiance.value"] = 2.0
 
@@ -95,7 +62,7 @@ def test_changes_and_renders_wait_for_a_render_in_another_thread(act):
     act(parameters)  # its kernels are there afterwards
     done = threading.Event()
     thread = threading.Thread(target=lambda: (act(parameters), done.set()))
-    with runtime.one_at_a_time.lock:
+    with runtime.render_lock.lock:
         thread.start()
         assert not done.wait(0.3)  # without the lock, it takes less than a thousandth of that
     assert done.wait(60)
