@@ -47,6 +47,17 @@ def logarithmic(axes: Axes, x: str, y: str) -> None:
     axes.grid(alpha=0.25)
 
 
+def plain_numbers(axes: Axes) -> None:
+    """Label logarithmic axes with decimal numbers, 1, 2 and 5 of each decade, or fewer of many."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    for axis in (axes.xaxis, axes.yaxis):
+        least, most = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if most < 300 * least else (1,)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_locator(NullLocator())
+
+
 def legend(axes: Axes) -> None:
     """Put the names of lines below the plot."""
     figure: Any = axes.figure

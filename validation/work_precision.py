@@ -161,7 +161,7 @@ class Race:
         if not best:
             verdict = "no case comes so low"
         elif self.rivals:
-            verdict = f"no winner, for the intervals overlap: {', '.join([best, *self.rivals])}"
+            verdict = f"no winner, for the intervals overlap: {'; '.join([best, *self.rivals])}"
         elif others:
             longer = f"{self.longer:.2g} times as long"
             verdict = f"{best} is the fastest, {_shown(*self.times[best])} s; {others[0]} takes {longer}"
@@ -172,14 +172,14 @@ class Race:
     def row(self) -> Values:
         """The row of the table of what to use."""
         best, *others = self.times or [""]
-        row: Values = {"to get to an error of": self.error, "use": self.case or "nothing comes so low"}
+        row: Values = {"error": self.error, "use": self.case or "nothing comes so low"}
         row |= {
             "seconds": _shown(*self.times[best]) if best else None,
             "next best": None,
             "which takes": None,
         }
         if self.rivals:
-            row["use"] = f"no winner: {', '.join([best, *self.rivals])}"
+            row["use"] = f"no winner: {'; '.join([best, *self.rivals])}"
         elif others:
             row |= {"next best": others[0], "which takes": f"{self.longer:.2g} times as long"}
         return row
@@ -563,6 +563,7 @@ def diagram(title: str, found: Findings) -> Figure:
         label = "within the reference's own error"
         axes.axhspan(bottom / 10, found.reference_error, color="0.9", zorder=0, label=label)
     axes.set_ylim(bottom=0.8 * bottom)
+    plotting.plain_numbers(axes)
     plotting.legend(axes)
     return drawn
 
@@ -588,13 +589,6 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
     study.picture(f"{prefix}diagram", title, diagram(title, found), caption)
     if found.errors:
         study.records(f"{prefix}advice", f"{title}: what to use", found.advice(), first=not name)
-        times = {f"RMSE {error:g}": found.time_to(error) for error in found.errors}
-        rows = [
-            {"curve": curve} | {what: _shown(*t[curve]) for what, t in times.items()}
-            for curve in found.families
-        ]
-        note = "With 95 % intervals. Between cases, curves are straight in logarithms; beyond, unknown."
-        study.records(f"{prefix}times", f"{title}: seconds to an error", rows, note)
     note = "Medians of warm renders without loading the scene; cold: a first run. Errors in linear light."
     points = [point.row() for curve in found.families.values() for point in curve]
     study.records(f"{prefix}points", f"{title}: every case", points, note)

@@ -229,7 +229,7 @@ XML = """<scene version="3.0.0">
 
 
 NAMED = "a is the fastest, 1"
-LIKE = "no winner, for the intervals overlap: a, b"
+LIKE = "no winner, for the intervals overlap: a; b"
 ONLY = "only a comes so low"
 
 
@@ -246,7 +246,7 @@ def test_a_winner_is_named_only_if_intervals_are_apart(times, rmse, errors, verd
     assert verdict in found.verdicts[0]
     assert verdict in str(found)
     (row,) = found.advice()  # by the same rule
-    use = {NAMED: "a", ONLY: "a", LIKE: "no winner: a, b"}.get(verdict.removeprefix("RMSE of 0.1: "))
+    use = {NAMED: "a", ONLY: "a", LIKE: "no winner: a; b"}.get(verdict.removeprefix("RMSE of 0.1: "))
     assert row["use"] == (use or "nothing comes so low")
     assert row["next best"] == ("b" if verdict.endswith(NAMED) else None)
 
@@ -294,7 +294,7 @@ def test_command_writes_a_page(tmp_path, capsys, variant):
     assert "aa=2" in shown
     assert "index.html" in shown
     names = {path.name.removeprefix("error-vs-time-") for path in out.iterdir()}
-    assert {"index.html", "summary.json", "diagram.png", "points.csv", "times.csv"} <= names
+    assert {"index.html", "summary.json", "diagram.png", "points.csv", "advice.csv"} <= names
     cases.write_text(GOOD + '"bad" = {aa = 1, lattice = "none"}\n')
     assert main(["error-vs-time", "scene=3", f"cases={cases}", f"out={out}"]) == 1
     assert "bad" in capsys.readouterr().out

@@ -155,8 +155,8 @@ def _rounds(cost: Cost, **options: Any) -> dict[str, Values]:
     """Return adaptive renders, of a number of rays or to an error."""
     own = {"aa": None, "lattice": None, **options}
     most = 4 * max(cost.rounds, default=1)
-    cases = {f"adaptive, {spp} rays": {**own, "aamode": "noise", "spp": spp} for spp in cost.rounds}
-    aims = {f"adaptive, target {aim}": {**own, "aamode": None, "target": aim} for aim in cost.targets}
+    cases = {f"adaptive, spp={spp}": {**own, "aamode": "noise", "spp": spp} for spp in cost.rounds}
+    aims = {f"adaptive to a target, {aim}": {**own, "aamode": None, "target": aim} for aim in cost.targets}
     return cases | {name: {**case, "maxspp": most} for name, case in aims.items()}
 
 
@@ -193,11 +193,11 @@ def path(number: Number, cost: Cost) -> Trade:
     nodes = _scene(number, cost.path_size)
     calm = number in CALM
     kinds = ("path", "direct") if calm else ("path",)
-    cases = {f"{kind}, {spp} rays": {"integrator": kind, "spp": spp} for kind in kinds for spp in cost.counts}
+    cases = {f"{kind}, spp={spp}": {"integrator": kind, "spp": spp} for kind in kinds for spp in cost.counts}
     for sampler in cost.samplers:
         sensor = nodes["sensor"] | {"sampler": {"type": sampler}}
         own = {"scene": nodes | {"sensor": sensor}, "integrator": "path"}
-        cases |= {f"{sampler} sampler, {spp} rays": {**own, "spp": spp} for spp in cost.sampler_counts}
+        cases |= {f"{sampler} sampler, spp={spp}": {**own, "spp": spp} for spp in cost.sampler_counts}
     if calm and cost.counts:
         cases["mrt_whitted"] = {}
         cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}

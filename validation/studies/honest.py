@@ -139,5 +139,6 @@ def stated_and_true(scene: Any, *, seeds: int = 8, truth_spp: int = 2048) -> Fig
     axes.fill_between(span, span / 3, span * 3, color="0.93", label="within a factor of 3")
     axes.plot(span, span, color="black", linewidth=0.8)
     axes.plot(stated, true, marker="o", markersize=4, color=plotting.COLORS[0])
+    plotting.plain_numbers(axes)
     plotting.legend(axes)
     return drawn
