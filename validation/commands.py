@@ -61,7 +61,8 @@ def error_vs_time(
 
     settings = read_toml(cases)
     wrong = [f"an unknown entry {name!r}" for name in sorted(settings.keys() - set(KEYS))]
-    wrong += [f"no entry {name!r}" for name in KEYS[:2] if name not in settings]
+    if "cases" not in settings:
+        wrong.append("no entry 'cases'")
     if wrong:
         raise UsageError(f"{cases} has {wrong[0]}: it holds {', '.join(KEYS)}")
     if params:

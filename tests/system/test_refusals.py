@@ -166,7 +166,7 @@ def toml(text: str) -> dict[str, Content]:
     return {"a.toml": text}
 
 
-misused("error-vs-time 3 cases=a.toml", "no entry 'reference'", toml("cases = {}"))
+misused("error-vs-time 3 cases=a.toml", "no entry 'cases'", toml("reference = {}"))
 misused("error-vs-time 3 cases=a.toml", "unknown entry 'repeat'", toml("repeat = 2\n[cases]\na = {aa = 1}\n"))
 misused("sweep out a.toml workers=x", "must be a whole number", toml(""))
 misused("sweep out a.toml", "cannot read", toml("a ="))
