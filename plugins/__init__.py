@@ -84,7 +84,7 @@ def classes_of(table: str) -> tuple[Any, ...]:
 
 
 def is_known(thing: object) -> bool:
-    """Return whether Mitsuba or this folder has the class of an object, so that all its state is in sight.
+    """True if Mitsuba or this folder has the class of an object, so that all its state is in sight.
 
     What somebody else wrote in Python may depend on anything, and is asked each time.
     """
@@ -93,7 +93,7 @@ def is_known(thing: object) -> bool:
 
 
 def any_constructed() -> bool:
-    """Return whether this process has ever made one of ``PLUGINS``."""
+    """True if this process has ever made one of ``PLUGINS``."""
     return _constructed
 
 

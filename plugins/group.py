@@ -7,10 +7,7 @@ import numpy as np
 
 from .mesh_api import Placement, keep_apart, write_buffers
 from .parameters import ParameterError, bitmap, choice, segments
-from .quadric_kinds import KINDS, QuadricTable
-
-# Kinds that a group may hold
-CLOSED = tuple(name for name, kind in KINDS.items() if kind.closed)
+from .quadric_kinds import CLOSED, KINDS, QuadricTable
 
 
 class MrtGroup(mi.Mesh):

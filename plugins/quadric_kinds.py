@@ -93,6 +93,9 @@ class Sphere:
 class Axial:
     """A solid of revolution along z from 0 to 1, with a radius of 1 at z = 1: a side, and discs at its ends.
 
+    Its side is straight: the radius is 1 at z = 1 and grows by ``slope``, 0 or 1. A kind with another profile
+    overrides ``surface`` and ``derivatives``, which compute normals from that slope.
+
     Texture coordinates: u = azimuth / 2π in [0, 1), v = 1 - z on the side, the unit square around a disc.
     """
 
@@ -196,6 +199,7 @@ KINDS: dict[str, Any] = {
     "cylinder": _CYLINDER,
     "open cylinder": replace(_CYLINDER, closed=False),
 }
+CLOSED = tuple(name for name, kind in KINDS.items() if kind.closed)  #: those that a group may hold
 
 
 def _azimuth(q, r):

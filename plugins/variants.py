@@ -13,7 +13,7 @@ from . import is_known
 
 
 def is_jit() -> bool:
-    """Return whether the current variant is a vectorised one (LLVM or CUDA)."""
+    """True if the current variant is a vectorised one (LLVM or CUDA)."""
     return not mi.variant().startswith("scalar")
 
 
@@ -52,7 +52,7 @@ def put_where(where: mi.Bool, si: mi.SurfaceInteraction3f, **fields: object) -> 
 
 
 def varies(value: object) -> bool:
-    """Return whether a value is a texture that may vary over a surface.
+    """True if a value is a texture that may vary over a surface.
 
     ``mesh_attribute`` denies it, and a class that somebody else wrote in Python need not say so.
     """

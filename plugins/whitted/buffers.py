@@ -102,7 +102,7 @@ class PointBuffer:
         active: mi.Bool,
         test: Callable[[mi.UInt32], mi.Bool],
     ) -> mi.Bool:
-        """Return whether ``test(object)`` holds of an object listed where a ray comes to ``light`` from."""
+        """True if ``test(object)`` holds of an object listed where a ray comes to ``light`` from."""
 
         def visit(thing: mi.UInt32, state: tuple) -> tuple:
             return (dr.select(test(thing), -1, state[0]),)

@@ -68,24 +68,24 @@ class MaterialTable:
 
 
 def is_mrt_bsdf(bsdf: mi.BSDF) -> bool:
-    """Return whether a material is an ``mrt_bsdf`` itself: a class derived from it may be anything."""
+    """True if a material is an ``mrt_bsdf`` itself: a class derived from it may be anything."""
     return type(bsdf) is plugin("bsdf").MrtBSDF
 
 
 def has_mirror(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF reflects like a mirror."""
+    """True if a BSDF reflects like a mirror."""
     return bsdf.has_attribute("mirror_reflectance") or mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
 
 
 def is_textured(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
+    """True if a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
     if is_mrt_bsdf(bsdf):
         return mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
     return any(varies(node) or not is_known(node) for node in mi.traverse(bsdf).hierarchy)
 
 
 def is_anisotropic(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF depends on how the surface is turned about its normal."""
+    """True if a BSDF depends on how the surface is turned about its normal."""
     if is_mrt_bsdf(bsdf):
         return False
     names = {node.class_name() for node in mi.traverse(bsdf).hierarchy}

@@ -1,7 +1,7 @@
 """Facts about a scene, and the plan of the kernels that ``mrt_whitted`` makes for them.
 
-Plain data and one table, ``RULES``: nothing here knows Mitsuba. The integrator reads the facts, the rules
-decide, and the integrator obeys. A plan may be edited (``dataclasses.replace``) first.
+Plain data and one table, ``RULES``: nothing here knows Mitsuba. Rules map scene facts to a kernel plan, which
+the integrator follows. A plan may be edited (``dataclasses.replace``) first.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Mirror(NamedTuple):
 class SceneFacts:
     """The content of a scene, as far as a kernel depends on it."""
 
-    vectorised: bool  #: is the variant one that compiles kernels
-    pinhole: bool  #: do the rays of the first camera start at one point
+    vectorised: bool  #: the variant compiles kernels
+    pinhole: bool  #: all rays of the first camera start at one point
     native_shapes: int  #: shapes that only Mitsuba can trace
     meshes: int  #: meshes among these, and in groups
     spheres: int  #: spheres among them
@@ -56,16 +56,16 @@ class SceneFacts:
     lights: int  #: emitters but for the environment and those that are black
     random_lights: int  #: lights that are no point and no direction
     surface_emitters: int  #: lights that are a surface
-    lights_tabulated: bool  #: do all lights have a place in a table
-    environment: bool  #: is there an environment emitter
+    lights_tabulated: bool  #: all lights are rows of a table
+    environment: bool  #: there is an environment emitter
     sky: float  #: its largest radiance; 0 without one, inf where it is not known
     emission: float  #: the same of the surfaces
     lobes: tuple[tuple[str, bool], ...]  #: those of ``mrt_bsdf``, and whether a material may have them
     mirrors: tuple[Mirror, ...]  #: of the materials that reflect like a mirror
-    anisotropic: bool  #: does a material depend on tangents
-    textured: bool  #: does a material vary over its surface
+    anisotropic: bool  #: a material depends on the tangent frame
+    textured: bool  #: a material varies over its surface
     merge_obstacle: str  #: why the materials have no place in one table; "" where they do
-    differentiated: bool  #: are derivatives wanted
+    differentiated: bool  #: derivatives are wanted
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,11 @@ class KernelPlan:
     #: before these are compared with ``min_contribution``
     contribution_bounds: tuple[float, float]
     bvh: bool  #: Mitsuba's ray queries
-    coherent: bool  #: Embree's treatment of packets of like rays
+    coherent: bool  #: Embree's mode for packets of coherent rays
     quadrics: tuple[str, ...]  #: kinds of exact quadrics; others are traced as meshes
     planes: bool  #: analytic planes, else they are traced as meshes
-    light_buffers: bool  #: lists of what may be in the way of a light, in place of a search
-    eye_buffer: bool  #: lists of the quadrics that the camera may see, in place of a search
+    light_buffers: bool  #: per light, a cube map of the objects that may occlude it, in place of a search
+    eye_buffer: bool  #: the same around the camera, of the quadrics that it may see
     sky: str  #: "none", "parameter" or "environment"
     tangents: bool  #: derivatives of the surface by uv, and frames along them
     merged: bool  #: one BSDF with a table of materials, in place of a call to each
@@ -106,7 +106,7 @@ class IntegratorParams(Protocol):
 
 @dataclass
 class PlanInput:
-    """The ground for decisions: a scene, the integrator, and the decisions so far."""
+    """Input of the rules: scene facts, parameters of the integrator, decisions so far."""
 
     facts: SceneFacts
     integrator: IntegratorParams

@@ -77,7 +77,7 @@ class Quadrics:
         return state
 
     def occluded(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
-        """Return whether there is a quadric before ``ray.maxt``."""
+        """True if there is a quadric before ``ray.maxt``."""
         t, _, _ = self.intersect(ray, active, any_hit=True)
         return active & (t < ray.maxt)
 
@@ -86,7 +86,7 @@ class Quadrics:
         return self._boxes, self.leaf_of
 
     def block(self, leaf: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
-        """Return whether a quadric is before ``ray.maxt``."""
+        """True if a quadric is before ``ray.maxt``."""
         t, _ = self._meet(leaf, ray)
         return t < ray.maxt
 

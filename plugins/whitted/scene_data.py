@@ -140,7 +140,7 @@ class SceneData:
         return Hit(si, found, self.errors.bound(si, scale, found))
 
     def occluded(self, hit: Hit, light: Any, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Bool:
-        """Return whether anything blocks the segment from ``hit`` to the sample ``ds`` of a light."""
+        """True if anything blocks the segment from ``hit`` to the sample ``ds`` of a light."""
         o = self._off_surface(hit, ds.d)
         to_light = ds.p - o
         blocked = self.planes.separate(o, o + to_light * (1 - SHADOW_EPSILON))

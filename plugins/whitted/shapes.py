@@ -46,7 +46,7 @@ class Planes:
         return t, index, hit
 
     def separate(self, p: mi.Point3f, q: mi.Point3f) -> mi.Bool:
-        """Return whether there is a plane between two points."""
+        """True if there is a plane between two points."""
         blocked = mi.Bool(False)
         for equation in self.equations:
             # Opposite sides: no distance is computed, so none can be wrong
@@ -145,7 +145,7 @@ class Spheres:
         return np.stack([centers - radii, centers + radii], axis=1), np.arange(len(radii)), True
 
     def block(self, index: mi.UInt32, ray: mi.Ray3f) -> mi.Bool:
-        """Return whether a sphere blocks a ray, which Mitsuba answers the same to the bit."""
+        """True if a sphere blocks a ray, which Mitsuba answers the same to the bit."""
         row = self.balls(index, mi.Bool(True))
         o = ray.o - mi.Point3f(row.x, row.y, row.z)
         a = dr.squared_norm(ray.d)
@@ -161,7 +161,7 @@ class Spheres:
 
 
 def is_sphere(shape: mi.Shape) -> bool:
-    """Return whether a shape is Mitsuba's ``sphere``."""
+    """True if a shape is Mitsuba's ``sphere``."""
     return shape.shape_type() == +mi.ShapeType.Sphere
 
 

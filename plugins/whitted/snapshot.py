@@ -1,4 +1,4 @@
-"""What a scene is at one moment: the only module that decides whether something has changed.
+"""Snapshots of a scene: the only module that decides whether something has changed.
 
 All that ``mrt_whitted`` makes of a scene depends on three parts of its snapshot: the shapes, their materials
 and the lights. A part lists objects, references between them, their plain properties and the Dr.Jit index of
@@ -29,19 +29,19 @@ from .. import is_known, plugin
 from ..variants import is_jit
 
 Value = TypeVar("Value")
-MAX_TRACKED = 2**16  # objects of which it is known when they were updated
+MAX_TRACKED = 2**16  # objects whose updates are counted one by one
 PLAIN = (bool, int, float, str, bytes, type(None))
 
 
 class Updates:
-    """Counts updates by ``mi.traverse`` of objects, by id: those of an object that is alive are its own."""
+    """Counts updates by ``mi.traverse`` of objects, by id: ids are unique while the objects live."""
 
     def __init__(self) -> None:
         self._count = self._forgotten = 0
         self._last: dict[int, int] = {}
 
     def note(self, thing: Any) -> None:
-        """Take note that an object was updated."""
+        """Record that an object was updated."""
         if len(self._last) >= MAX_TRACKED:  # from now on all look as if they had been updated
             self._forgotten = self._count = self._count + 1
             self._last.clear()
@@ -61,7 +61,7 @@ class Part:
     """Some objects with their textures and the like, as they are; equal to itself only."""
 
     state: list[Any] = field(default_factory=list)  # what is compared
-    comparable: bool = True  # can a look tell that nothing has changed
+    comparable: bool = True  # equal states mean that nothing has changed
     known: bool = True  # Mitsuba or this project has the classes of all objects
     differentiated: bool = False  # are derivatives wanted
     _held: dict[int, Any] = field(default_factory=dict)  # objects, by id
@@ -158,7 +158,7 @@ class Snapshot:
 
 
 class Kept(dict[str, tuple[Hashable, Any]]):
-    """What was made last of something, under a key that names all that it depends on."""
+    """One-entry cache per name, keyed by all dependencies."""
 
     def __call__(self, name: str, key: Hashable, make: Callable[..., Value], *arguments: object) -> Value:
         """Return ``make(*arguments)``, made last time if the key was the same."""
