@@ -7,31 +7,23 @@ import os
 from typing import Any
 
 from mrt_mitsuba.command.options import render_parser
-from mrt_mitsuba.command.registry import commands
+from mrt_mitsuba.command.registry import COMMANDS, command_parser
 
 
 def complete() -> None:
-    """Print the words that may come next, and exit."""
+    """Print the words that may come next, and exit. Where there are none, shells complete names of files."""
     import argcomplete
 
-    files = argcomplete.FilesCompleter()
-    known = commands()
-    before = os.environ["COMP_LINE"][: int(os.environ["COMP_POINT"])].split(" ")[1:-1]
-    own = known[before[0]] if before and before[0] in known else render_parser()
+    first, *before = os.environ["COMP_LINE"][: int(os.environ["COMP_POINT"])].split(" ")[1:]
+    forms = (command_parser(first) if before and first in COMMANDS else render_parser()).forms
 
-    def first(prefix: str, **about: Any) -> list[str]:
-        return [*known, *files(prefix, **about)]
-
-    def others(prefix: str, **about: Any) -> list[str]:
-        name, equals, value = prefix.partition("=")
-        form = own.forms.get(name, "")
-        if not equals:
-            return [f"{each}=" for each in own.forms]
-        values = files(value, **about) if "FILE" in form or form in ("PATH", "DIR") else form.split("|")
-        return [f"{name}={each}" for each in values if not each.isupper()]
+    def words(prefix: str, **about: Any) -> list[str]:
+        name, equals, _ = prefix.partition("=")
+        if equals:
+            return [f"{name}={each}" for each in forms.get(name, "").split("|") if each.islower()]
+        return [f"{each}=" for each in forms] if before else list(COMMANDS)
 
     parser = argparse.ArgumentParser(add_help=False)
-    for name, completer in (("first", first), ("others", others)):
-        action: Any = parser.add_argument(name, nargs="*" if name == "others" else None)
-        action.completer = completer
+    action: Any = parser.add_argument("words", nargs="*")
+    action.completer = words
     argcomplete.autocomplete(parser)

@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 from mrt_mitsuba import __version__
 from mrt_mitsuba.command.options import parse
-from mrt_mitsuba.command.registry import HELP, commands, run
+from mrt_mitsuba.command.registry import COMMANDS, HELP, run
 from mrt_mitsuba.errors import MrtError, UsageError, escaped, needs_extra, one_line
 from mrt_mitsuba.interrupts import interrupt_behind, leave_now
 
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code, problem = _guarded(words)
         if problem:
             print(f"mrt: {one_line(problem)}", file=sys.stderr)
-    picture = bool(words) and words[0] not in commands()
+    picture = bool(words) and words[0] not in COMMANDS
     if arguments is None and (picture or code == INTERRUPTED):
         # the interpreter would wait for kernels that run, and take apart all that it has loaded
         leave_now(code)
@@ -96,17 +96,16 @@ def _dispatch(words: list[str]) -> int:
         sys.stderr.write(usage())
         return UsageError.exit_code
     name = words[0]
-    known = commands()
-    if name in known:
-        return run(known[name], words[1:])
+    if name in COMMANDS:
+        return run(name, words[1:])
     if name == "--version":
         print(f"mrt-mitsuba {__version__}")
         return 0
     if not HELP.isdisjoint(words):
-        return run(known["help"], [])
+        return run("help", [])
     if name.isdecimal() and all("=" in word for word in words[1:]):
         raise UsageError(f"FILENAME is missing: write mrt FILENAME {name}, or mrt ./{name} for that name")
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
+    close = difflib.get_close_matches(name, COMMANDS, n=1, cutoff=0.75)
     if close and (len(words) == 1 or words[1].startswith("--")):  # which makes no sense as a render either
         raise UsageError(f"no command {name!r}: did you mean mrt {close[0]}, or mrt ./{name} for a picture?")
     options = parse(words)

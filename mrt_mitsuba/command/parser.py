@@ -57,13 +57,13 @@ class Parser(argparse.ArgumentParser):
         for word in words:
             name, equals, value = word.partition("=")
             name = name.removeprefix("--")
-            if not equals or arguments[-1:] == ["--xml"]:
+            if not equals or arguments[-1:] in ([f"--{each}"] for each in self.forms):  # its value
                 arguments.append(word)
                 continue
             if name in given - self.repeatable:
                 raise UsageError(f"{name} is given twice")
             given.add(name)
-            if name in self.forms or f"--{name}" in self._option_string_actions:
+            if name in self.forms:
                 arguments.append(f"--{name}={value}")
             else:
                 others[name] = value

@@ -1,11 +1,11 @@
-"""The sub-commands of ``mrt``: an entry here, and the function that it names."""
+"""The sub-commands of ``mrt``: a row each, and the function that it names."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import Protocol
+from typing import NamedTuple
 
 from mrt_mitsuba.command.options import add_options, add_scene, read_scene
 from mrt_mitsuba.command.parser import Parser
@@ -16,81 +16,135 @@ TOOLS = "mrt_mitsuba.command.tools"
 CHECKS = "mrt_mitsuba.validation.commands"
 HELP = {"-h", "--help"}
 WITHOUT_MITSUBA = ("help", "scenes", "info")
+REQUIRED = ("xml", "cases")  # options of sub-commands
 AT_LEAST = ("psnr", "p_value")  # limits that a measure must reach; it must not exceed the others
 LIMITS = ("mae", "rmse", "rel_mse", "display", "psnr", "largest", "flip", "p_value")
 
 
-class Add(Protocol):
-    """Adds a sub-command: its name, its words, what it does, and "module:function"."""
+class Command(NamedTuple):
+    """A sub-command. Its function takes words by name, as text; it raises ``MrtError`` or returns the exit
+    code."""
 
-    def __call__(self, name: str, words: str, text: str, function: str) -> Parser: ...
-
-
-def commands() -> dict[str, Parser]:
-    """Return the parsers of the sub-commands, by name."""
-    added = Parser(prog="mrt").add_subparsers(parser_class=Parser)
-
-    def command(name: str, words: str, text: str, function: str) -> Parser:
-        parser = added.add_parser(name, usage=f"mrt {name} {words}".strip(), description=text)
-        parser.set_defaults(run=function)
-        return parser
-
-    _add_tools(command)
-    _add_checks(command)
-    return dict(added.choices)
+    module: str
+    function: str
+    form: str  #: its words, in a line
+    text: str  #: what it does
+    words: Mapping[str, str] = {}  #: the help of "WORD", "name=FORM" and "--flag"
+    options: Sequence[str] = ()  #: names in the table of options
 
 
-def _add_tools(command: Add) -> None:
-    """Add the sub-commands that neither render one picture nor check."""
-    parser = command("help", "[COMMAND]", "print this text, or the help of a command", f"{TOOLS}:show_help")
-    parser.add_argument("command", metavar="COMMAND", nargs="?", help="name of a command")
+COMMANDS = {
+    "help": Command(
+        TOOLS,
+        "show_help",
+        "[COMMAND]",
+        "print this text, or the help of a command",
+        {"[COMMAND]": "name of a command"},
+    ),
+    "doctor": Command(
+        TOOLS, "doctor", "", "print versions, the LLVM in use, the variants; render a self-test"
+    ),
+    "scenes": Command(TOOLS, "show_scenes", "", "list the numbered scenes"),
+    "info": Command(
+        TOOLS, "info", "FILE.exr", "print size, layers and header of an EXR", {"FILE.exr": "a picture"}
+    ),
+    "export": Command(
+        TOOLS,
+        "export",
+        "SCENE|scene=PATH --xml PATH [--stock] [name=value ...]",
+        "write a scene as Mitsuba XML",
+        {"xml=PATH": "file to write", "--stock": "with Mitsuba's own plugins only"},
+        ("scene", "plugins", "width", "height", "fresnel", *MODEL_OPTIONS),
+    ),
+    "sweep": Command(
+        TOOLS,
+        "sweep",
+        "OUT FILE.toml [name=value ...]",
+        "render the grid in a file on several processes or machines",
+        {
+            "OUT": "folder of the pictures and their table",
+            "FILE.toml": "scene, grid and options",
+            "workers=N": "processes on this machine (default: one for each core)",
+            "cluster=ADDRESS": "address of a Dask scheduler (default: this machine)",
+        },
+        ["plugins"],
+    ),
+    "diff": Command(
+        CHECKS,
+        "diff",
+        "A.exr B.exr [name=value ...]",
+        "compare two pictures; exit code 1 beyond a limit, 2 if they do not compare",
+        {
+            "A.exr": "a picture",
+            "B.exr": "the reference",
+            "layer=NAME": "layer to compare (default: the picture)",
+            "out=PATH": "picture of the difference to write (default: none)",
+            **{
+                f"{name}=LIMIT": f"{'least' if name in AT_LEAST else 'largest'} {name} that passes"
+                for name in LIMITS
+            },
+        },
+    ),
+    "check": Command(
+        CHECKS,
+        "check",
+        "SCENE|scene=PATH [name=value ...]",
+        "check the laws of every BSDF, shape and emitter; find pixels that are not finite",
+        {
+            "out=DIR": "folder of the report to write (default: none)",
+            "quick=1|0": "fewer samples (default: 0)",
+        },
+        ("scene", "plugins"),
+    ),
+    "error-vs-time": Command(
+        CHECKS,
+        "error_vs_time",
+        "SCENE|scene=PATH cases=FILE.toml [name=value ...]",
+        "measure error and time of any settings of any scene",
+        {
+            "cases=FILE.toml": "settings to compare",
+            "out=DIR": "folder of the report (default: error-vs-time)",
+        },
+        ("scene", "plugins"),
+    ),
+}
 
-    about = "print versions, the LLVM in use, the variants; render a self-test"
-    command("doctor", "", about, f"{TOOLS}:doctor")
-    command("scenes", "", "list the numbered scenes", f"{TOOLS}:show_scenes")
 
-    parser = command("info", "FILE.exr", "print size, layers and header of an EXR", f"{TOOLS}:info")
-    parser.add_argument("file", metavar="FILE.exr", help="a picture")
-
-    words = "SCENE|scene=PATH --xml PATH [--stock] [name=value ...]"
-    parser = command("export", words, "write a scene as Mitsuba XML", f"{TOOLS}:export")
-    add_scene(parser)
-    parser.add_argument("--xml", metavar="PATH", required=True, help="file to write")
-    parser.add_argument("--stock", action="store_true", help="with Mitsuba's own plugins only")
-    add_options(parser, ("width", "height", "fresnel", *MODEL_OPTIONS))
-
-    about = "render the grid in a file on several processes or machines"
-    parser = command("sweep", "OUT FILE.toml [name=value ...]", about, f"{TOOLS}:sweep")
-    parser.add_argument("out", metavar="OUT", help="folder of the pictures and their table")
-    parser.add_argument("path", metavar="FILE.toml", help="scene, grid and options")
-    parser.option("workers", "N", "processes on this machine (default: one for each core)")
-    parser.option("cluster", "ADDRESS", "address of a Dask scheduler (default: this machine)")
-    add_options(parser, ["plugins"])
+def command_parser(name: str) -> Parser:
+    """Return the parser of a sub-command."""
+    command = COMMANDS[name]
+    parser = Parser(prog=f"mrt {name}", usage=f"mrt {name} {command.form}".strip(), description=command.text)
+    if "scene" in command.options:
+        add_scene(parser)
+    for word, text in command.words.items():
+        key, equals, form = word.partition("=")
+        if equals:
+            parser.option(key, form, text, required=key in REQUIRED)
+        elif word.startswith("--"):
+            parser.add_argument(word, action="store_true", help=text)
+        else:
+            key = word.strip("[]").partition(".")[0].lower()
+            parser.add_argument(key, metavar=word.strip("[]"), nargs="?" if "[" in word else None, help=text)
+    add_options(parser, [each for each in command.options if each not in parser.forms])
+    return parser
 
 
-def _add_checks(command: Add) -> None:
-    """Add the sub-commands that compare and check."""
-    about = "compare two pictures; exit code 1 beyond a limit, 2 if they do not compare"
-    parser = command("diff", "A.exr B.exr [name=value ...]", about, f"{CHECKS}:diff")
-    parser.add_argument("a", metavar="A.exr", help="a picture")
-    parser.add_argument("b", metavar="B.exr", help="the reference")
-    parser.option("layer", "NAME", "layer to compare (default: the picture)")
-    parser.option("out", "PATH", "picture of the difference to write (default: none)")
-    for name in LIMITS:
-        parser.option(name, "LIMIT", f"{'least' if name in AT_LEAST else 'largest'} {name} that passes")
-
-    about = "check the laws of every BSDF, shape and emitter; find pixels that are not finite"
-    parser = command("check", "SCENE|scene=PATH [name=value ...]", about, f"{CHECKS}:check")
-    add_scene(parser)
-    parser.option("out", "DIR", "folder of the report to write (default: none)")
-    parser.option("quick", "1|0", "fewer samples (default: 0)")
-
-    words = "SCENE|scene=PATH cases=FILE.toml [name=value ...]"
-    about = "measure error and time of any settings of any scene"
-    parser = command("error-vs-time", words, about, f"{CHECKS}:error_vs_time")
-    add_scene(parser)
-    parser.option("cases", "FILE.toml", "settings to compare, and the reference", required=True)
-    parser.option("out", "DIR", "folder of the report to write (default: error-vs-time)")
+def run(name: str, words: Sequence[str]) -> int:
+    """Run a sub-command with its words; return its exit code. Raises ``UsageError`` for wrong words."""
+    command = COMMANDS[name]
+    parser = command_parser(name)
+    if not HELP.isdisjoint(words):
+        sys.stdout.write(parser.format_help())
+        return 0
+    values = read_scene(parser, words)
+    if name not in WITHOUT_MITSUBA:
+        check_start()
+    if "scene" in values:
+        import_plugins(values.pop("plugins", ()))
+    elif "scene" in command.options:
+        parser.error("SCENE or scene=PATH is missing")
+    code: int = getattr(import_module(command.module), command.function)(**values)
+    return code
 
 
 def import_plugins(names: Sequence[str]) -> None:
@@ -100,25 +154,3 @@ def import_plugins(names: Sequence[str]) -> None:
 
         runtime.use()
         user_plugins.load(names)
-
-
-def run(parser: Parser, words: Sequence[str]) -> int:
-    """Run a sub-command with its words; return its exit code. Raises ``UsageError`` for wrong words."""
-    if not HELP.isdisjoint(words):
-        sys.stdout.write(parser.format_help())
-        return 0
-    if "scene" in parser.forms:
-        values = read_scene(parser, words)
-        if values.get("scene", "") == "":
-            parser.error("SCENE or scene=PATH is missing")
-    else:
-        values, others = parser.read(words)
-        if others:
-            parser.unknown(min(others))
-    module, function = values.pop("run").split(":")
-    if parser.prog.split()[-1] not in WITHOUT_MITSUBA:
-        check_start()
-    if "scene" in values:
-        import_plugins(values.pop("plugins", ()))
-    code: int = getattr(import_module(module), function)(**values)
-    return code

@@ -12,7 +12,7 @@ from typing import Any
 import mrt_mitsuba
 from mrt_mitsuba import llvm
 from mrt_mitsuba.command.options import checked, render_parser
-from mrt_mitsuba.command.registry import commands
+from mrt_mitsuba.command.registry import COMMANDS, command_parser
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError, printable
 from mrt_mitsuba.files.images import read_channels
 from mrt_mitsuba.files.replacing import check_target
@@ -29,16 +29,15 @@ else:
 
 def usage() -> str:
     """Return the help text of the command."""
-    rows = "".join(f"  {name:<15} {parser.description}\n" for name, parser in commands().items())
+    rows = "".join(f"  {name:<15} {command.text}\n" for name, command in COMMANDS.items())
     return f"{render_parser().format_help()}\ncommands ('mrt COMMAND --help' says more):\n{rows}"
 
 
 def show_help(command: str | None = None) -> int:
     """Print the help text of ``mrt``, or of a sub-command."""
-    known = commands()
-    if command is not None and command not in known:
-        raise UsageError(f"no command {command!r}: choose one of {', '.join(known)}")
-    sys.stdout.write(known[command].format_help() if command else usage())
+    if command is not None and command not in COMMANDS:
+        raise UsageError(f"no command {command!r}: choose one of {', '.join(COMMANDS)}")
+    sys.stdout.write(command_parser(command).format_help() if command else usage())
     return 0
 
 
@@ -121,12 +120,12 @@ def export(scene: int | str, xml: str, stock: bool = False, **given: Any) -> int
     return 0
 
 
-def sweep(out: str, path: str, *, workers: str | None = None, **given: Any) -> int:
+def sweep(out: str, file: str, *, workers: str | None = None, **given: Any) -> int:
     """Render the sweep that a TOML file describes; return 1 if a job failed."""
-    settings = read_toml(path)
+    settings = read_toml(file)
     refused = settings.keys() & {"out", "progress"}
     if refused:
-        raise UsageError(f"{path}: {min(refused)} cannot be set in a file")
+        raise UsageError(f"{file}: {min(refused)} cannot be set in a file")
     count = int(workers) if workers and workers.isdecimal() else workers
     if count is not None:
         settings["workers"] = count

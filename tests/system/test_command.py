@@ -141,13 +141,11 @@ def test_info_and_plugins_of_a_file(mrt_command, run_command, tmp_path):
         ("mrt ex", ["export"]),
         ("mrt out aam", ["aamode="]),
         ("mrt out 3 aamode=s", ["aamode=sobel"]),
-        ("mrt check scene=a", ["scene=a.xml"]),
         ("mrt diff a b fl", ["flip="]),
         ("mrt sweep out wor", ["workers="]),
     ],
 )
 def test_tab_completes_words(mrt_command, tmp_path, line, words):
-    (tmp_path / "a.xml").touch()
     variables = {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE": "1"}
     variables |= {
         "_ARGCOMPLETE_STDOUT_FILENAME": "found",

@@ -210,13 +210,10 @@ def test_bar_on_a_terminal_shows_the_time_left(monkeypatch):
     assert text.endswith("\r")  # cleared at the end
 
 
-COMMANDS = registry.commands()
-
-
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", registry.COMMANDS)
 def test_every_word_of_a_command_arrives_and_is_explained(name, capsys):
-    parser = COMMANDS[name]
-    module, function = parser.get_default("run").split(":")
+    parser = registry.command_parser(name)
+    module, function, *_ = registry.COMMANDS[name]
     taken = inspect.signature(getattr(importlib.import_module(module), function)).parameters
     words = {action.dest for action in parser._actions} - {"number"}
     words -= {"plugins"} if "scene" in words else set()  # imported before
@@ -246,8 +243,7 @@ words("export", "3 --stock xml=a", {"scene": 3, "xml": "a", "stock": True})
 
 @pytest.mark.parametrize(("name", "text", "values"), words)
 def test_words_are_read(name, text, values):
-    run = COMMANDS[name].get_default("run")
-    assert options.read_scene(COMMANDS[name], text.split()) == {**values, "run": run}
+    assert options.read_scene(registry.command_parser(name), text.split()) == values
 
 
 def test_every_option_arrives_at_the_render_or_is_the_commands_own():
