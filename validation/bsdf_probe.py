@@ -16,12 +16,12 @@ RESOLUTION = 700  # of the quadrature of an albedo, on each axis
 
 
 def rgb(value: float | Sequence[float]) -> dict[str, object]:
-    """A colour, or a grey, as a Mitsuba dict."""
+    """Return a colour, or a grey, as a Mitsuba dict."""
     return {"type": "rgb", "value": value if isinstance(value, float | int) else list(value)}
 
 
 def at_angle(degrees: float) -> Array:
-    """A direction at an angle to the normal, away from every axis and plane of symmetry."""
+    """Return a direction at an angle to the normal, away from every axis and plane of symmetry."""
     theta = np.radians(degrees)
     return np.array([np.sin(theta) * 0.8, np.sin(theta) * 0.6, np.cos(theta)])
 

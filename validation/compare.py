@@ -27,11 +27,11 @@ Picture = Any  # the path of an EXR, an array or the result of a render
 ORDER = "RGBXYZUVA"  # of channels within a layer, after others
 ROUNDING = 1e-5  # relative size of differences that are float32's: sums in another order, fused operations
 EPSILON = 0.01  # keeps black pixels from dominating the relative error
-CELL = 16  # pixels, a side of the cells whose means are compared
-BLOCKS = 64  # at most, along a side of the picture, whose signs are changed at a time
-# changes of the signs, and how many of the largest results tell an exponential law
-FLIPS = 500
-TAIL = 25
+CELL = 16  # pixels, side of the cells whose means are compared
+MAX_BLOCKS = 64  # along a side of the picture; the signs of a block change together
+# Random changes of signs, and number of the largest results to which an exponential tail is fitted
+SIGN_CHANGES = 500
+TAIL_SIZE = 25
 CHEAP = ("mae", "rmse", "rel_mse", "display", "psnr", "largest", "p_value")
 MEASURES = (*CHEAP[:-1], "flip", "p_value")
 # HDR-FLIP exposes from where the brightest value is tone-mapped (ACES) to 0.85 to where the median is
@@ -112,7 +112,7 @@ class Difference:
         write_png(f"{stem}.png", np.float32(colors[..., :3]))
 
     def text(self, names: Sequence[str] = MEASURES) -> str:
-        """A line for each of these measures, and one that says where the largest difference is."""
+        """Return a line for each of these measures, and one that says where the largest difference is."""
         lines = [f"{name:<8} {'-' if v is None else f'{v:.4g}'}" for name, v in self.measures(names).items()]
         return "\n".join([*lines, f"the largest is at row {self.place[0]}, column {self.place[1]}"])
 
@@ -171,7 +171,7 @@ Layer = tuple[Array, Array | None, tuple[int, ...]]
 
 
 def read_layer(source: Picture, layer: str = "", name: str = "the picture") -> Layer:
-    """The picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
+    """Return the picture, or a layer of it, of whatever ``compare`` takes. Raises ``UsageError``."""
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
         try:
@@ -198,7 +198,7 @@ def read_layer(source: Picture, layer: str = "", name: str = "the picture") -> L
 
 
 def _layer_of(channels: Mapping[str, Array], headers: Mapping[str, Any], layer: str, name: str) -> Layer:
-    """A layer of channels by name, with its variance and window where they are known."""
+    """Return a layer of channels by name, with its variance and window where they are known."""
     groups: dict[str, list[str]] = {}  # channels by layer, in order
     for key in sorted(channels, key=lambda key: (ORDER.find(key[-1]), key)):
         groups.setdefault(key.rpartition(".")[0] or key, []).append(key)
@@ -213,11 +213,11 @@ def _layer_of(channels: Mapping[str, Array], headers: Mapping[str, Any], layer: 
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:
-    """The probability that noise alone makes so large a difference, of the mean of channels.
+    """Return the probability that noise alone makes so large a difference, of the mean of channels.
 
     Uniform for equal pictures of equal noise. Means over cells are tested by the signs of differences alone,
     which is exact. How the largest difference over its deviation continues the tail of the others depends on
-    sizes alone; it is off where a single ray may make it, and has a hundredth of the level.
+    sizes alone; it is wrong where a single ray may cause it, and has a hundredth of the level.
     """
     variances = [variance.mean(axis=2) for _, variance, _ in sides if variance is not None]
     if not variances:
@@ -233,7 +233,7 @@ def _p_value(sides: Sequence[Layer]) -> float | None:
 
 
 def _p_of_means(difference: Array) -> float:
-    """The probability of the means of differences [H, W] between equal pictures, over cells and all.
+    """Return the probability of the means of differences [H, W] between equal pictures, over cells and all.
 
     Their noise is as often positive as negative, whatever its law. So the least p value of Student's test is
     compared with those after random changes of sign of blocks of pixels; where it is among the least of
@@ -242,7 +242,7 @@ def _p_of_means(difference: Array) -> float:
     """
     from scipy import stats
 
-    side = -(-max(difference.shape) // BLOCKS)
+    side = -(-max(difference.shape) // MAX_BLOCKS)
     rows = difference[1:] * difference[:-1]
     columns = difference[:, 1:] * difference[:, :-1]
     near = np.append(rows, columns)
@@ -257,10 +257,10 @@ def _p_of_means(difference: Array) -> float:
     count = cell_sums(np.ones_like(picture), side)
     square = cell_sums(picture**2, side)
     blocks = cell_sums(picture, side)
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (FLIPS, *blocks.shape[1:]))
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (SIGN_CHANGES, *blocks.shape[1:]))
     blocks = np.concatenate([blocks, signs * blocks])
     least = np.inf
-    for size in (max(CELL // side, CELL // 2), BLOCKS):
+    for size in (max(CELL // side, CELL // 2), MAX_BLOCKS):
         pixels = cell_sums(count, size)
         squares = cell_sums(square, size)
         most = np.maximum(squares * pixels, 1e-300)
@@ -271,9 +271,9 @@ def _p_of_means(difference: Array) -> float:
         least = np.minimum(least, p * max(np.count_nonzero(squares), 1))
     surprise = -np.log(least + 1e-300)
     others = np.sort(surprise[1:])[::-1]
-    tail = others[:TAIL] - others[TAIL]
-    if surprise[0] > others[TAIL] and tail.any():
-        return float(TAIL / FLIPS * np.exp((others[TAIL] - surprise[0]) / tail.mean()))
+    tail = others[:TAIL_SIZE] - others[TAIL_SIZE]
+    if surprise[0] > others[TAIL_SIZE] and tail.any():
+        return float(TAIL_SIZE / SIGN_CHANGES * np.exp((others[TAIL_SIZE] - surprise[0]) / tail.mean()))
     return float(np.mean(others >= surprise[0]))
 
 
@@ -311,19 +311,19 @@ def p_values(ours: ArrayLike, theirs: ArrayLike) -> dict[str, float]:
 
 
 def averaged(pictures: ArrayLike) -> tuple[Array, Array]:
-    """The mean of independent pictures [H, W, channels], in float64, and its squared error [H, W]."""
+    """Return the mean of independent pictures [H, W, channels], in float64, and its squared error [H, W]."""
     pictures = np.asarray(pictures)
     mean = pictures.mean(axis=0, dtype=np.float64)
     return np.asarray(mean), pictures.var(axis=0, ddof=1).mean(axis=-1) / len(pictures)
 
 
 def sidak(p: float, count: int) -> float:
-    """The probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
+    """Return the probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
     return 1.0 if p >= 1 else float(-np.expm1(count * np.log1p(-p)))
 
 
 def cell_sums(values: Array, size: int) -> Array:
-    """The sums [..., rows, columns, C] over cells of ``size`` × ``size`` pixels."""
+    """Return the sums [..., rows, columns, C] over cells of ``size`` × ``size`` pixels."""
     for axis in (-3, -2):
         values = np.add.reduceat(values, np.arange(0, values.shape[axis], size), axis=axis)
     return values

@@ -56,7 +56,7 @@ def read_original(path: str | os.PathLike[str]) -> Original:
 
 
 def shortened(picture: np.ndarray, window: tuple[int, int, int, int], block: int, bits: int) -> np.ndarray:
-    """A window of a picture, as the means of its blocks, rounded to a number of significant bits."""
+    """Return a window of a picture, as the means of its blocks, rounded to a number of significant bits."""
     x, y, width, height = window
     part = np.float64(picture[y : y + height, x : x + width])
     part = part.reshape(height // block, block, width // block, block, -1).mean(axis=(1, 3))

@@ -67,7 +67,7 @@ def save_report(
 
 
 def notebook(study: Study, *, title: str) -> str:
-    """The page of a study as a frame for a notebook, whose own style it leaves alone."""
+    """Return the page of a study as a frame for a notebook, whose own style it leaves alone."""
     page = html.escape(_files([study], title)["index.html"].decode())
     return f'<iframe srcdoc="{page}" style="width: 100%; height: 40rem; border: 1px solid #d5d8dd"></iframe>'
 
@@ -104,7 +104,7 @@ def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[st
 
 
 def _drawn(content: Any) -> Values:
-    """The bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
+    """Return the bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
     if isinstance(content, np.ndarray):
         kind = "picture"
         broad = content.shape[1] > 2 * len(content)
@@ -119,7 +119,7 @@ def _drawn(content: Any) -> Values:
 
 
 def cell(value: object) -> str:
-    """A value as people read it: floats to four digits, a dash for an unknown one."""
+    """Return a value as people read it: floats to four digits, a dash for an unknown one."""
     if value is None or value != value:
         return "–"
     if isinstance(value, bool):

@@ -25,7 +25,7 @@ SPP = 64  # of the samplers of ``SCENES``
 
 
 def with_materials(scene: Scene, change: Callable[[Material], Material]) -> Scene:
-    """A scene whose spheres and planes have other materials."""
+    """Return a scene whose spheres and planes have other materials."""
 
     def changed(things: Sequence[Any]) -> Any:
         return tuple(replace(thing, material=change(thing.material)) for thing in things)
@@ -43,7 +43,7 @@ def sensor(
     film: Node | None = None,
     **more: Any,
 ) -> Node:
-    """A camera with a film and a sampler."""
+    """Return a camera with a film and a sampler."""
     common = {"type": "hdrfilm", "rfilter": {"type": rfilter}, "component_format": "float32"}
     return {
         "type": "perspective",
@@ -56,7 +56,7 @@ def sensor(
 
 
 def ball_scene(bsdf: Node, *, size: int) -> mi.Scene:
-    """A ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size``."""
+    """Return a ball of the material on a floor under a sky and a point light, ``size`` × ¾ ``size``."""
     film = {"width": size, "height": size * 3 // 4, "pixel_format": "rgb"}
     return mi.load_dict(
         {
@@ -79,7 +79,7 @@ LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
 
 
 def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> mi.Scene:
-    """A scene by name, at a size; ``film`` and further nodes replace its own."""
+    """Return a scene by name, at a size; ``film`` and further nodes replace its own."""
     nodes = SCENES[name]()
     size = {"width": width, "height": height}
     if name == "crop":
@@ -96,7 +96,7 @@ def _to() -> mi.ScalarTransform4f:
 
 
 def _checks(count: int) -> Node:
-    """A diffuse chessboard."""
+    """Return a diffuse chessboard."""
     squares = _to().scale([count, count, 1])
     board = {"type": "checkerboard", "to_uv": squares, "color0": rgb(0.1), "color1": rgb(0.9)}
     return {"type": "diffuse", "reflectance": board}
@@ -265,7 +265,7 @@ def load_room(
     radius: float = 0.8,
     **others: Node,
 ) -> mi.Scene:
-    """A ball on a floor under a lamp and a faint sky; ``others`` add nodes or replace these.
+    """Return a ball on a floor under a lamp and a faint sky; ``others`` add nodes or replace these.
 
     ``bsdf``: of the ball, matte by default; ``radius``: of the lamp, whose power does not depend on it.
     """
@@ -285,7 +285,7 @@ def load_room(
 
 
 def load_kind(kind: str, size: int, sampler: str = "multijitter", rfilter: str = "box") -> mi.Scene:
-    """A room with one of the ``KINDS`` of noise."""
+    """Return a room with one of the ``KINDS`` of noise."""
     places = np.random.default_rng(1).uniform([-3, 1, -3], [3, 3, 3], (30, 3)).tolist()
     inside = {"type": "ref", "id": "fog"}
     kinds: dict[str, Node] = {

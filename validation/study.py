@@ -52,7 +52,7 @@ class Bound:
         return "goal" if high <= self.limit else "slower" if low > self.limit else "open"
 
     def as_dict(self) -> Values:
-        """The values of ``summary.json``."""
+        """Return the values of ``summary.json``."""
         figures = {"measured": self.measured, "limit": self.limit, "sense": self.sign}
         return {"name": self.name, **figures, "holds": self.holds, "verdict": self.verdict, "note": self.note}
 
@@ -139,7 +139,7 @@ class Study:
             gc.unfreeze()
 
     def summary(self) -> Values:
-        """The study in values of JSON; infinite and undefined numbers become text."""
+        """Return the study in values of JSON; infinite and undefined numbers become text."""
 
         def plain(value: object) -> object:
             return value.item() if isinstance(value, np.generic) else str(value)
@@ -159,7 +159,7 @@ class Study:
 
 
 def findings(part: Callable[..., None], **options: Any) -> Study:
-    """The findings of a part of a study, or of the ``run`` of a whole one."""
+    """Return the findings of a part of a study, or of the ``run`` of a whole one."""
     study = Study("", "")
     part(study, **options)
     return study

@@ -73,7 +73,7 @@ class Point:
 
     @classmethod
     def of(cls, name: str, times: Array, gram: Array, **more: Any) -> Point:
-        """The figures from the seconds of repeats and their matrix G; ``more``: the other fields."""
+        """Return the figures from the seconds of repeats and their matrix G; ``more``: the other fields."""
         seconds = float(np.median(times))
         squares = np.diag(gram)
         repeats = len(times)
@@ -113,7 +113,7 @@ class Point:
         return self.rmse > RESOLVED * self.reference_error
 
     def row(self) -> Values:
-        """The row of the table of all cases."""
+        """Return the row of the table of all cases."""
 
         def interval(ends: Interval) -> str:
             return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"
@@ -170,7 +170,7 @@ class Race:
         return f"RMSE of {self.error:g}: {verdict}."
 
     def row(self) -> Values:
-        """The row of the table of what to use."""
+        """Return the row of the table of what to use."""
         best, *others = self.times or [""]
         row: Values = {"error": self.error, "use": self.case or "nothing comes so low"}
         row |= {
@@ -249,7 +249,7 @@ class Findings:
         return [str(self.race(error)) for error in self.errors]
 
     def advice(self) -> list[Values]:
-        """A row for each of ``errors``: the case that gets there first, and the next other curve."""
+        """Return a row for each of ``errors``: the case that gets there first, and the next other curve."""
         return [self.race(error).row() for error in self.errors]
 
     def __str__(self) -> str:
@@ -265,7 +265,7 @@ class Findings:
         return "\n".join([*lines, f"the reference's own error: {own}", *self.verdicts])
 
     def study(self) -> Study:
-        """The findings in the form that pages are made of."""
+        """Return the findings in the form that pages are made of."""
         scene = f"scene {self.scene}" if self.scene.isdigit() else self.scene
         study = Study("error-vs-time", f"{TITLE}: {scene}", seconds=self.took)
         describe(study, self, "", "All cases")

@@ -71,7 +71,7 @@ WIDTHS: dict[Number, int] = {0: 384, 1: 336, 2: 300, 3: 252, 4: 192}
 
 
 def shown(scene: Number) -> Cost:
-    """The cost of the documentation's measurements in a scene."""
+    """Return the cost of the documentation's measurements in a scene."""
     width = WIDTHS.get(scene, DOCS.size[0])
     return replace(DOCS, size=(width, width * 3 // 4))
 
@@ -142,7 +142,7 @@ def title_of(number: Number) -> str:
 
 
 def _scene(number: Number, size: tuple[int, int], **options: Any) -> Values:
-    """A scene of the report, or Mitsuba's Cornell box, as a dict."""
+    """Return a scene of the report, or Mitsuba's Cornell box, as a dict."""
     width, height = size
     if isinstance(number, int):
         return mrt.scene_dict(number, width=width, height=height, **options)

@@ -51,7 +51,7 @@ REFINED: Values = {"progress": Progress(), "aa": 4, "aamode": "sobel", "lattice"
 
 
 def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
-    """A scene, and the same with kernels that leave nothing out."""
+    """Return a scene, and the same with kernels that leave nothing out."""
     width, height = size
     nodes = mrt.scene_dict(number, width=width, height=height)
     planned = mi.load_dict(nodes)
@@ -70,7 +70,7 @@ def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
 
 
 def measure(number: int, size: tuple[int, int], repeats: int) -> Values:
-    """The row of a scene with edges refined: figures as planned, and factors of the other ways."""
+    """Return the row of a scene with edges refined: figures as planned, and factors of the other ways."""
     planned, whole = scenes_of(number, size)
     general_way = REFINED | {"layers": "all"}
     renders = {

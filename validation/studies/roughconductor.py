@@ -62,7 +62,7 @@ def theirs(alpha: float, distribution: str = "beckmann", *, visible: bool = True
 
 
 def compare_pointwise(alpha: float, distribution: str = "beckmann", *, count: int) -> dict[str, float]:
-    """The largest relative differences over ``count`` random pairs of directions, by ``NAMES``.
+    """Return the largest relative differences over ``count`` random pairs of directions, by ``NAMES``.
 
     Of plain D sampling's density only where |ωi + ωo|² > ``SHORT``: Mitsuba's divides by ωo·h and so feels
     the rounding of the length of ωo, by 6e-8 / |ωi + ωo|².

@@ -98,7 +98,7 @@ def gloss(study: Study, *, quick: bool) -> None:
 
 
 def physical(m: Material) -> Material:
-    """A material that Mitsuba's plugins take: colours up to 1, positive roughness, no diffuse part.
+    """Return a material that Mitsuba's plugins take: colours up to 1, positive roughness, no diffuse part.
 
     Then ``mrt_bsdf`` and ``roughplastic``, which refracts diffuse light, are the same. Lobes narrower than
     0.1 make fireflies: no mean of some hundred samples of them is normal, as the tests need it.
@@ -108,12 +108,12 @@ def physical(m: Material) -> Material:
 
 
 def changed(nodes: Values, key: str, change: Callable[[Any], Any]) -> Values:
-    """The nodes with a parameter changed wherever one has it."""
+    """Return the nodes with a parameter changed wherever one has it."""
     return {n: node | {key: change(node[key])} if key in node else node for n, node in nodes.items()}
 
 
 def mistakes(nodes: Values) -> dict[str, Values]:
-    """The nodes with a mistake, by its name."""
+    """Return the nodes with a mistake, by its name."""
 
     def brighter(color: Values) -> Values:
         return color | {"value": [1.02 * x for x in color["value"]]}

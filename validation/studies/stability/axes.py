@@ -210,7 +210,7 @@ def _aimed(targets: Array, eyes: Array) -> Rays:
 
 @np.errstate(invalid="ignore")  # rounding may leave no root
 def _quadratic(a: Array, b: Array, c: Array, holds: Callable[[Array], Array] = np.isfinite) -> Array:
-    """The first root t beyond an offset that ``holds``, by a schoolbook's float32 formula; else infinity."""
+    """Return the first root t beyond an offset that ``holds``, by the textbook formula; else infinity."""
     root = np.sqrt(b * b - 4 * a * c)
     both = np.stack([-b - root, -b + root]) / (2 * a)
     both[~((both > OFFSET) & holds(both))] = np.inf

@@ -192,7 +192,7 @@ def _ball(**changes: Any) -> Scene:
 
 
 def _shiny(**changes: Any) -> Scene:
-    """A material without a diffuse part, which would hide the lobe."""
+    """Return a material without a diffuse part, which would hide the lobe."""
     return replace(_ball(diffuse=(0, 0, 0), specular=(1, 1, 1), **changes), sky=(0, 0, 0))
 
 
@@ -240,7 +240,7 @@ class Path:
         return {"fresnel": "dielectric", "clamp": True, **self.settings}
 
     def truth(self, scene: Scene, **settings: Any) -> np.ndarray:
-        """The picture [H, W, 3] of a scene by the float64 tracer, with other settings than its own."""
+        """Return the picture [H, W, 3] of a scene by the float64 tracer, with other settings than its own."""
         return reference_render(scene, width=WIDTH, height=HEIGHT, **self.chosen | settings).image
 
     def rendered(self) -> np.ndarray:
@@ -296,7 +296,7 @@ def light_paths(quick: bool) -> Iterator[Case]:
 
 
 def difference(image: np.ndarray, truth: np.ndarray) -> float:
-    """The largest difference in a channel that 95 % of the pixels stay below; inf for bad values."""
+    """Return the largest difference in a channel that 95 % of the pixels stay below; inf for bad values."""
     if not (np.isfinite(image) & (image >= 0)).all():
         return np.inf
     return float(np.quantile((abs(image - truth) / (truth + SMALL)).max(axis=-1), SHARE))
@@ -344,7 +344,7 @@ def scaled_and_moved(scene: Scene, name: str) -> Iterator[Case]:
 
 
 def placed(scene: Scene, factor: float, sizes: float) -> Scene:
-    """The scene with all lengths multiplied, or shifted by a multiple of its size, along no axis.
+    """Return the scene with all lengths multiplied, or shifted by a multiple of its size, along no axis.
 
     Its size: the distance from the camera to what it looks at.
     """
