@@ -6,7 +6,8 @@ the first kernel with a minimum, maximum or clip in it. Without such a library, 
 that does not exist, so that Dr.Jit reports a missing library and never picks up an old one by itself.
 
 Dr.Jit loads the library when it is first imported, so the choice is made by ``import mrt_mitsuba``. It takes
-a few milliseconds and loads nothing: versions are read from file names.
+a few milliseconds and loads nothing: versions are read from file names. On other systems than Linux, Dr.Jit
+looks for a library itself (on macOS where Homebrew installs it), unless the variable names one.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Choice(NamedTuple):
     rejected: list[str]
 
     def describe(self) -> str:
-        """One sentence for people."""
+        """Return the choice in one sentence."""
         if self.version is None:
             but = f", but {'; '.join(self.rejected)}" if self.rejected else ""
             return f"no usable LLVM {OLDEST} or newer was found{but}. {HELP}"
@@ -55,63 +56,57 @@ class Choice(NamedTuple):
 
 
 def version_text(version: Version) -> str:
-    """A version as text, e.g. "19.1"."""
+    """Return a version as text, e.g. "19.1"."""
     return ".".join(map(str, version)) if version[0] else "older than 16"
 
 
 def choose(environ: Mapping[str, str], search_path: Iterable[str], system: Iterable[str]) -> Choice:
-    """Choose a library by the rule above; changes nothing.
+    """Return the library chosen by the rule above; changes nothing.
 
     ``search_path``: folders that may hold installed packages; ``system``: folders to search for a system
     library.
     """
-    wheel, problem = wheel_library(search_path)
+    wheel = wheel_library(search_path)
     named = environ.get(VARIABLE, "")
-    candidates = []  # path, where it is from, and what speaks against it
+    candidates = []  # path, and where it is from
     if named not in ("", BLOCKED, wheel):
-        candidates.append((named, f"named by {VARIABLE}", ""))
+        candidates.append((named, f"named by {VARIABLE}"))
     if wheel:
-        candidates.append((wheel, f"from the package {WHEEL}", problem))
+        candidates.append((wheel, f"from the package {WHEEL}"))
     paths = {os.path.realpath(path) for path in _matching(system, "libLLVM")} - {os.path.realpath(wheel)}
     versions = [(version_in_name(path) or (), path) for path in filter(os.path.isfile, paths)]
-    for version, path in sorted(versions, reverse=True):
-        if version:
-            candidates.append((path, "of the system", ""))
+    candidates += [(path, "of the system") for version, path in sorted(versions, reverse=True) if version]
     rejected: list[str] = []
-    for path, source, objection in candidates:
+    for path, source in candidates:
         found = version_of(path)
-        if found and found[0] >= OLDEST and not objection:
+        if found and found[0] >= OLDEST:
             return Choice(path, found, source, rejected)
         what = f"is LLVM {version_text(found)}" if found else "cannot be loaded"
-        rejected.append(objection or f"{path}, {source}, {what}")
+        rejected.append(f"{path}, {source}, {what}")
     return Choice(None, None, "none", rejected)
 
 
-def wheel_library(search_path: Iterable[str]) -> tuple[str, str]:
-    """The library of the package karellen-llvm-core and what speaks against it, "" for neither.
+def wheel_library(search_path: Iterable[str]) -> str:
+    """Return the library of the package karellen-llvm-core, or "".
 
     Its path is taken from the list of files (RECORD) in the package's metadata. ``importlib.metadata`` gives
     the same, but importing it takes 30 ms.
     """
     for info in _matching(search_path, WHEEL.replace("-", "_") + "-"):
-        try:
-            with open(f"{info}/RECORD", encoding="utf-8") as lines:
-                files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
-        except (OSError, UnicodeDecodeError):
-            continue
-        for path in filter(os.path.isfile, (os.path.normpath(f"{info}/../{file}") for file in files)):
-            # Python makes symbolic links at its next start; without them, libraries it needs are missing
-            unfinished = os.path.exists(f"{info}/symlinks.txt") and not os.path.exists(f"{info}/axle.done")
-            problem = (
-                f"the installation of {WHEEL} is unfinished: whoever may write to {info} has to start Python "
-                f"once ({sys.executable} -c '')"
-            )
-            return path, problem if unfinished else ""
-    return "", ""
+        with (
+            contextlib.suppress(OSError, UnicodeDecodeError),
+            open(f"{info}/RECORD", encoding="utf-8") as lines,
+        ):
+            files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
+            for path in filter(os.path.isfile, (os.path.normpath(f"{info}/../{file}") for file in files)):
+                return path
+    return ""
 
 
 def system_folders(environ: Mapping[str, str]) -> list[str]:
-    """The folders in which a Linux system keeps libLLVM."""
+    """Return the folders in which a Linux system keeps libLLVM; none on other systems."""
+    if sys.platform != "linux":
+        return []
     return [
         *filter(None, environ.get("LD_LIBRARY_PATH", "").split(":")),
         f"{sys.prefix}/lib",  # conda
@@ -132,14 +127,14 @@ def _matching(folders: Iterable[str], prefix: str) -> Iterator[str]:
 
 
 def version_in_name(path: str) -> Version | None:
-    """The version in a file name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1, or None."""
+    """Return the version in a file name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1, or None."""
     name = re.fullmatch(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.so(?:\.(\d+(?:\.\d+)*))?", os.path.basename(path))
     numbers = name and (name[1] or name[2])
     return tuple(map(int, numbers.split("."))) if numbers else None
 
 
 def version_of(library: str) -> Version | None:
-    """The version of a library, given by path or by a name for the dynamic linker; None: unusable.
+    """Return the version of a library, a path or a name for the dynamic linker; None if unusable.
 
     Where neither the name nor the target of a symbolic link holds it, the library is asked, in a process of
     its own.
@@ -176,13 +171,13 @@ print(*(number.value for number in numbers))
 def prepare() -> Choice:
     """Choose once per process and set Dr.Jit's environment variable; return the choice.
 
-    Warns where the user's own setting is not followed, and where Dr.Jit was imported before the choice.
+    Warns if the user's own setting is not followed, or if Dr.Jit was imported before the choice.
     """
-    early = "drjit" in sys.modules
     choice = choose(os.environ, sys.path, system_folders(os.environ))
+    if choice.path or sys.platform == "linux":
+        os.environ[VARIABLE] = choice.path or BLOCKED
     text = None
-    os.environ[VARIABLE] = choice.path or BLOCKED
-    if early and choice.path:
+    if "drjit" in sys.modules and choice.path:
         text = problem(choice)
     elif choice.rejected and VARIABLE in choice.rejected[0]:
         text = f"{choice.rejected[0]}; Dr.Jit needs LLVM {OLDEST} or newer. Instead: {choice.describe()}"
@@ -192,8 +187,8 @@ def prepare() -> Choice:
 
 
 def problem(choice: Choice) -> str | None:
-    """The obstacle to Dr.Jit's use of LLVM, with the fix, or None."""
-    if choice.path is None:
+    """Return what keeps Dr.Jit from using LLVM, with the fix, or None."""
+    if choice.path is None and sys.platform == "linux":
         return choice.describe()
     import drjit as dr
 
@@ -201,7 +196,7 @@ def problem(choice: Choice) -> str | None:
     if loaded >= OLDEST:
         return None
     library = f"LLVM {loaded}, with which it would abort," if loaded > 0 else "no LLVM"
-    return (
-        f"Dr.Jit loaded {library} in place of {choice.path}. Import mrt_mitsuba before mitsuba and drjit, or "
-        f"set {VARIABLE} to a libLLVM of version {OLDEST} or newer."
+    wanted = (
+        f" in place of {choice.path}. Import mrt_mitsuba before mitsuba and drjit, or" if choice.path else ":"
     )
+    return f"Dr.Jit loaded {library}{wanted} set {VARIABLE} to a libLLVM of version {OLDEST} or newer."

@@ -73,17 +73,15 @@ def test_broken_metadata_and_folders_are_passed_over(tmp_path):
     assert llvm.choose({llvm.VARIABLE: str(loop)}, places, []).path == path
 
 
-def test_unfinished_installation_is_not_used(tmp_path):
-    """So it is after the superuser installed, until Python first starts with the right to write there."""
-    site, path = wheel(tmp_path / "venv")
-    info = next(Path(site).iterdir())
-    (info / "symlinks.txt").touch()
-    for environ in ({}, {llvm.VARIABLE: path}):
-        choice = llvm.choose(environ, [site], [str(Path(path).parent)])
-        assert choice.path is None
-        assert "is unfinished: whoever may write" in choice.describe()
-    (info / "axle.done").touch()
-    assert llvm.choose({}, [site], []).path == path
+def test_other_systems_are_left_to_drjit(monkeypatch):
+    """Where Dr.Jit looks by itself, nothing is blocked: the variable stays as it was."""
+    monkeypatch.setattr(llvm.sys, "platform", "darwin")
+    monkeypatch.setattr(llvm.sys, "path", [])
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    choice = llvm.prepare.__wrapped__()
+    assert choice.path is None
+    assert llvm.VARIABLE not in llvm.os.environ
+    assert llvm.problem(choice) is None  # of the LLVM that Dr.Jit has loaded
 
 
 def test_inherited_choice_is_not_taken_for_the_users(tmp_path):
