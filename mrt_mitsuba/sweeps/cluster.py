@@ -111,9 +111,7 @@ class LocalWorker(SubprocessWorker):
         self.process = await asyncio.create_subprocess_exec(*command, cwd=self.folder, env=environ)
 
 
-def _local(
-    count: int, dashboard: int | None, devices: list[str], security: Security, folder: str
-) -> SpecCluster:
+def _local(count: int, dashboard: int | None, devices: list[str], security: Any, folder: str) -> SpecCluster:
     """Return a scheduler in this process, and workers in processes of their own with one thread for jobs.
 
     All listen on the loopback only, and talk TLS with a key made for this sweep, as other users of this
