@@ -109,8 +109,8 @@ class Passes:
         if "image" in step.layers:
             self._count(pattern.size, ... if edge is None else self._edge, anew=pattern.first == 0)
         if "square" in step.layers:
-            variance = np.maximum(self.layers.pop("square") - self.layers["image"] ** 2, 0)
-            self.layers["variance"] = variance / (pattern.size - 1)  # of the means
+            square = self.layers.pop("square")
+            self.layers["variance"] = _variance_of_mean(square, self.layers["image"], pattern.size)
 
     def _expose(self, step: Pass, exposer: Exposer, before: FilmAccumulator | None) -> FilmAccumulator:
         """Expose the padded region of a film or, after an exposure, the pixels at edges in addition."""
@@ -130,8 +130,8 @@ class Passes:
             accumulated = before.accumulate(exposed, chosen)
         self._count(rays, edge)
         if moments:
-            square = exposed.square[:, 0] / rays - (exposed.total[:, 0] / rays) ** 2
-            variance = np.maximum(square, 0) / (rays - 1) * film.filter_variance_ratio
+            variance = _variance_of_mean(exposed.square[:, 0] / rays, exposed.total[:, 0] / rays, rays)
+            variance *= film.filter_variance_ratio
             self._layer("variance")[:] = film.picture(np.moveaxis(variance, 0, -1))[self._padded]
         self._develop(exposer, accumulated.mean())
         return accumulated
@@ -265,3 +265,9 @@ class Passes:
             planes = np.zeros((*shape, channels) if name == "image" else (channels, *shape), np.float32)
             self.layers[name] = planes if name == "image" else np.moveaxis(planes, 0, -1)
         return self.layers[name]
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of values that are not finite, or whose squares are not
+def _variance_of_mean(square: np.ndarray, mean: np.ndarray, count: int) -> np.ndarray:
+    """Return the variance of means of ``count`` values each, given the means of the values' squares."""
+    return np.asarray(np.maximum(square - mean**2, 0) / (count - 1))

@@ -54,19 +54,23 @@ class Progress:
 class TerminalProgress(Progress):
     """Print messages, and a bar if ``bar_file`` is a terminal, or in a notebook.
 
-    ``show_plan``: whether to print the render plan. Messages go to ``file``, bars to ``bar_file``; these
-    count in ``unit``.
+    ``show_plan``: whether to print the render plan. Messages go to ``file``, or nowhere without ``messages``;
+    bars, which count in ``unit``, to ``bar_file``, for stages that take longer than ``delay`` seconds.
     """
 
     def __init__(
         self,
         *,
         show_plan: bool = False,
+        messages: bool = True,
+        delay: float = 0.0,
         unit: str = "px",
         file: TextIO | None = None,
         bar_file: TextIO | None = None,
     ) -> None:
         self.show_plan = show_plan
+        self.messages = messages
+        self.delay = delay
         self.unit = unit
         self.file = file or sys.stdout
         self.bar_file = bar_file or sys.stderr
@@ -79,7 +83,7 @@ class TerminalProgress(Progress):
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
         bars = self.bar_file.isatty() or "ipykernel" in sys.modules
         on_bar = message if bars and title == ROUNDS else ""  # one line, which each round updates
-        if message and not on_bar:
+        if message and not on_bar and self.messages:
             print(message, file=self.file, flush=True)
         if not bars:
             yield _ignore
@@ -89,6 +93,7 @@ class TerminalProgress(Progress):
             from tqdm.auto import tqdm
 
         looks: Any = {"unit": self.unit, "unit_scale": True, "dynamic_ncols": True, "leave": False}
+        looks["delay"] = self.delay
         with tqdm(total=total, desc=title, postfix=on_bar or None, file=self.bar_file, **looks) as bar:
             yield bar.update
 
@@ -130,12 +135,16 @@ class NotebookProgress(TerminalProgress):
 
 
 def default_progress() -> Progress:
-    """The progress of a render where the caller gives none: bars in notebooks, else nothing."""
-    return NotebookProgress() if "ipykernel" in sys.modules else Progress()
+    """Return the progress of a render that is given none: bars in notebooks and on terminals."""
+    if "ipykernel" in sys.modules:
+        return NotebookProgress()
+    if sys.stderr is not None and sys.stderr.isatty():
+        return TerminalProgress(messages=False, delay=0.5)
+    return Progress()
 
 
 def _ignore(steps: int) -> None:
-    """Take no notice of progress."""
+    """Progress callback that does nothing."""
 
 
 @dataclass
@@ -147,6 +156,11 @@ class Timings:
     compile: float = 0.0  #: kernels that were not in the cache
     kernels: float = 0.0  #: kernels running
     passes: dict[str, float] = field(default_factory=dict)  #: by the name of the pass
+
+    def __repr__(self) -> str:
+        parts = {"load": self.load, **self.passes, "of these: compile": self.compile, "kernels": self.kernels}
+        named = ", ".join(f"{name} {seconds:.3g}" for name, seconds in parts.items())
+        return f"<Timings: {self.total:.3g} s: {named}>"
 
 
 class Job:

@@ -4,17 +4,20 @@ import io
 import re
 import sys
 import types
+from contextlib import nullcontext
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from cases import Cases
+from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.rendering import exposing
 from mrt_mitsuba.rendering.plan import Rounds
-from mrt_mitsuba.rendering.progress import NotebookProgress, TerminalProgress, default_progress
+from mrt_mitsuba.rendering.progress import NotebookProgress, Progress, TerminalProgress, default_progress
 
 SIZE = 16
 
@@ -143,6 +146,25 @@ def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):
 class Terminal(io.StringIO):
     def isatty(self):
         return True
+
+
+def test_a_script_on_a_terminal_shows_a_bar_that_moves(monkeypatch, capsys):
+    """Long passes are cut, to the same bits; nothing else is printed."""
+    assert type(default_progress()) is Progress
+    whole = mrt.render(3, width=64, height=48, aa=2, aamode="none", focaldist=0).image
+    monkeypatch.setattr(exposing, "WAVEFRONT", 2048)
+    monkeypatch.setattr(exposing, "QUICK", 0)
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    progress = default_progress()
+    progress.delay = 0
+    result = mrt.render(3, width=64, height=48, aa=2, aamode="none", focaldist=0, progress=progress)
+    assert_array_equal(result.image, whole)
+    assert "Rendering" in sys.stderr.getvalue()
+    assert not capsys.readouterr().out
+    steps: list[int] = []
+    progress.stage = lambda *_: nullcontext(steps.append)
+    mrt.render(3, width=64, height=48, aa=2, aamode="none", focaldist=0, progress=progress)
+    assert steps == [512] * 6
 
 
 def test_a_terminal_shows_rounds_on_one_line():

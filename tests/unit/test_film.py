@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from cases import Cases
 from nodes import sensor
 from numpy.testing import assert_allclose
 
@@ -67,6 +69,35 @@ def test_moments_of_a_canvas(variant, rfilter):
     assert_allclose(canvas.peak.ravel(), colors.mean(0).max(-1), rtol=1e-6)
     if rfilter == "box":
         assert_allclose((canvas.sums / canvas.weights).reshape(3, 6), colors.mean(-1), rtol=1e-6)
+
+
+SETTINGS = Cases()
+SETTINGS({"spp": 16})
+SETTINGS({"spp": 4, "aamode": "sobel", "aa": 2, "focaldist": 1.0})
+SETTINGS({"spp": 2, "aamode": "luma", "aa": 2, "lattice": "report"})
+SETTINGS({"spp": 32, "aamode": "noise"})
+SETTINGS({"target": 0.05, "maxspp": 64})
+SETTINGS({"target": "5%", "maxspp": 64})
+
+
+@pytest.mark.filterwarnings("ignore::mrt_mitsuba.errors.MrtWarning")
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 3e38])
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+@pytest.mark.parametrize("options", SETTINGS)
+def test_values_that_are_not_finite_spoil_no_error(options, rfilter, bad):
+    """A ray in fifty; nothing but warnings of our own is said, and errors and targets are numbers."""
+
+    class Bad(mi.SamplingIntegrator):
+        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
+            value = sampler.next_1d()
+            return mi.Spectrum(dr.select(value < 0.02, bad, value)), mi.Bool(True), []
+
+    look = sensor([0, 0, 1], [0, 0, 0], (12, 9), rfilter=rfilter)
+    scene = {"type": "scene", "sensor": look, "light": {"type": "constant"}}
+    result = mrt.render(mi.load_dict(scene), integrator=Bad(mi.Properties()), **options)
+    if error := result.error:
+        assert np.isfinite([error.rmse, error.low, error.target or 0]).all()
+        assert error.high >= error.rmse
 
 
 @pytest.mark.parametrize("region", [None, (3, 3, 4, 4)])
