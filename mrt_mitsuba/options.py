@@ -17,7 +17,7 @@ Values = Mapping[str, Any]  # by the names of options or parameters
 StrPath = str | os.PathLike[str]
 
 UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
-SMALLEST_MEMORY = 64 * 2**20  # bytes; about what one tile with all layers takes
+SMALLEST_MEMORY = 64 * 2**20  # bytes
 
 
 class Kind(NamedTuple):
@@ -35,7 +35,7 @@ class Kind(NamedTuple):
 
 
 def integer(low: int, high: int) -> Kind:
-    """The kind of whole numbers in [low, high]."""
+    """Return the kind of whole numbers in [low, high]."""
 
     def convert(value: Any) -> int:
         number = _whole(value)
@@ -45,7 +45,7 @@ def integer(low: int, high: int) -> Kind:
 
 
 def choice(*names: str) -> Kind:
-    """The kind of a choice among names."""
+    """Return the kind of a choice among names."""
 
     def convert(value: Any) -> str:
         return _only(str(value), value in names)
@@ -54,7 +54,7 @@ def choice(*names: str) -> Kind:
 
 
 def subset(known: Iterable[str]) -> Kind:
-    """The kind of comma lists of known names, each once, or ``all``."""
+    """Return the kind of comma lists of known names, each once, or ``all``."""
     known = tuple(known)
 
     def convert(value: Any) -> tuple[str, ...]:
@@ -67,7 +67,7 @@ def subset(known: Iterable[str]) -> Kind:
 
 
 def _only(value: Value, allowed: bool) -> Value:
-    """The value, where it is allowed; else a ``ValueError``."""
+    """Return the value if it is allowed; else raise ``ValueError``."""
     if not allowed:
         raise ValueError
     return value
@@ -109,7 +109,7 @@ def _point(value: Any) -> tuple[float, ...]:
 
 
 def _target(value: Any) -> Target | tuple[float, ...]:
-    """A target, or the point of an OBJ file that the camera looks at."""
+    """Return an error target, or the point of an OBJ file that the camera looks at."""
     if isinstance(value, Iterable) and not isinstance(value, str):
         return _point(value)
     return Target.of(value)
@@ -146,7 +146,7 @@ def _parameters(value: Any) -> dict[str, Any]:
 
 
 def instance(kind: type, allowed: str) -> Kind:
-    """The kind of objects of a class, for Python only."""
+    """Return the kind of objects of a class, for Python only."""
     return Kind("", allowed, lambda value: _only(value, isinstance(value, kind)))
 
 
@@ -174,7 +174,7 @@ PARAMETERS = Kind(
 
 
 def either(names: Sequence[str]) -> str:
-    """The text "a, b or c"."""
+    """Return the text "a, b or c"."""
     return " or ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
 
 
@@ -188,7 +188,7 @@ def option(default: Any, kind: Kind, text: str = "", shown: str | None = None, n
 
 
 def table(kind: Any) -> dict[str, dataclasses.Field[Any]]:
-    """The fields that are options of the command, by name."""
+    """Return the fields that are options of the command, by name."""
     return {f.name: f for f in dataclasses.fields(kind) if f.metadata and f.metadata["kind"].form}
 
 
@@ -210,9 +210,9 @@ def is_path(scene: object, ending: str | tuple[str, ...]) -> bool:
 
 
 def is_obj(scene: object, model: Values) -> bool:
-    """Whether a scene is given as the path of an OBJ file.
+    """True if a scene is given as the path of an OBJ file.
 
-    Raises ``UsageError`` for options of a model where it is not.
+    Raises ``UsageError`` for options of a model if it is not.
     """
     obj = is_path(scene, ".obj")
     useless = [name for name, value in model.items() if (name, value) != ("convention", "report")]

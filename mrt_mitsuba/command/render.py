@@ -21,7 +21,7 @@ from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
 
 
 def run(options: Options) -> int:
-    """Render and write what the options say; return the exit code."""
+    """Render a scene and write its picture; return the exit code."""
     check_start()
     for path in options.outputs():
         check_target(path, options.inputs())
@@ -59,7 +59,7 @@ def run(options: Options) -> int:
             aim = "" if target is None else f"; target {target:.3g}"
             if target is not None and options.error is not None and options.error.relative:
                 aim += f", {options.error} of the mean luminance"
-            print(f"Error: {result.error}, {result.rounds[-1].spp:.1f} rays a pixel{aim}")
+            print(f"Error: {result.error}, {result.rounds[-1].spp:.1f} spp{aim}")
         print(f"Wrote {printable(' and '.join(options.outputs()))}")
         print(f"Render time: {seconds:.6f}s")
     return 0
@@ -80,7 +80,7 @@ def show_log(level: str) -> None:
 
 
 def banner(options: Options) -> str:
-    """The parameters of the render, one per line."""
+    """Return the parameters of the render, one per line."""
     distance, reach = options.focus(None, FOCAL_RANGE)
     if isinstance(options.scene, int):
         from mrt_mitsuba.scene.report import report_scene

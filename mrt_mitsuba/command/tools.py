@@ -140,7 +140,7 @@ def sweep(out: str, file: str, *, workers: str | None = None, **given: Any) -> i
 
 
 def _axes(grid: Any, before: str = "") -> Iterator[tuple[str, Any]]:
-    """The axes of a grid; keys with a dot that have no quotes make tables in TOML."""
+    """Yield the axes of a grid; keys with a dot that have no quotes are nested tables in TOML."""
     if not isinstance(grid, Mapping):
         raise UsageError("grid must be a table: write [grid] and a line for each key")
     for key, values in grid.items():
@@ -151,7 +151,7 @@ def _axes(grid: Any, before: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def read_toml(path: str) -> dict[str, Any]:
-    """The tables of a TOML file; ``UsageError`` where it cannot be read."""
+    """Return the tables of a TOML file; raise ``UsageError`` if it cannot be read."""
     try:
         require_file(path)
         with open(path, "rb") as file:

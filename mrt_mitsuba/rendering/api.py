@@ -78,8 +78,8 @@ class Result:
         )
 
     def header(self) -> dict[str, Any]:
-        """The header attributes of an EXR: how the picture was made, and nothing such as seconds that changes
-        when it is made again.
+        """Return the header attributes of an EXR: how the picture was made, and nothing such as seconds that
+        changes when it is made again.
         """
         version = self.versions["mrt-mitsuba"]
         estimated: dict[str, Any] = {}
@@ -168,7 +168,7 @@ def render(
 
     A scene of one's own is rendered as Mitsuba renders it: by the rules of its film, and of its sampler where
     ``aa``, ``aamode`` and ``spp`` are left out. From ``spp=2`` on, "luma" and "sobel" know the variance of
-    every pixel and ignore what noise explains; with one random ray they take noise for edges ("geometry"
+    every pixel and ignore what noise explains; with one random sample they take noise for edges ("geometry"
     never does). With ``target``, samples are allocated adaptively until the estimated error reaches it.
 
     ``motionmode="frames"`` averages ``motionsamples`` whole renders, as the report does; "stratified" is one

@@ -46,13 +46,13 @@ Lattice = Literal["report", "centered", "film"]
 #: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
 #: the order of its arguments; those of the picture can distinguish noise from edges
 DETECTORS = {"luma": ("image",), "sobel": ("image",), "geometry": ("normal", "depth")}
-# Of the report's scenes, where nothing else is asked for
+# Defaults of the report's scenes
 AA = 4
 AAMODE = "sobel"
-FILM = "film"  # the lattice by the rules of a scene's film
-NOISE = "noise"  # the aamode that puts rays where the variance is
-MIN_SPP = 16  # rays of a pixel from which its variance is known
-MAX_SPP = 4096  # of a pixel on average, where a target alone would ask for more
+FILM = "film"  # the lattice of a scene's film
+NOISE = "noise"  # the aamode that allocates samples by variance
+MIN_SPP = 16  # samples per pixel from which the variance is estimated
+MAX_SPP = 4096  # mean samples per pixel, where a target alone would ask for more
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
 
 
@@ -116,7 +116,7 @@ class RenderSettings:
     aamode: str | None = option(
         None,
         choice("none", *DETECTORS, NOISE),
-        f"refine all pixels, only edges that a detector finds ({', '.join(DETECTORS)}), or where noise is",
+        f"refine all pixels, only edges by a detector ({', '.join(DETECTORS)}), or noisy pixels",
         AAMODE,
     )
     target: Target | tuple[float, ...] | None = option(
@@ -137,7 +137,7 @@ class RenderSettings:
         False, SWITCH, "mix the picture with its denoised version where that errs less; with target or spp"
     )
     maxspp: int | None = option(
-        None, integer(MIN_SPP, 2**24), "rays of a pixel at most, with a target, on average", str(MAX_SPP)
+        None, integer(MIN_SPP, 2**24), "largest mean number of samples per pixel, with a target", str(MAX_SPP)
     )
     maxseconds: float | None = option(None, NUMBER, "seconds to spend at most, with a target", "none")
     lattice: str | None = option(
@@ -157,7 +157,7 @@ class RenderSettings:
         "report", choice("report", "corrected"), "depth of field as in the report, or without its flaws"
     )
     layers: tuple[str, ...] = option(
-        (), subset(LAYERS), f"further EXR layers: all, or some of {', '.join(LAYERS)}", "none"
+        (), subset(LAYERS), f"more EXR layers: all, or some of {', '.join(LAYERS)}", "none"
     )
     motion: tuple[float, ...] | None = option(
         None, VECTOR._replace(form="DX,DY,DZ"), "motion blur: how far the camera moves", "none"
@@ -194,18 +194,18 @@ class RenderSettings:
     integrator: Any = option(
         None,
         ANYTHING._replace(form="NAME"),
-        "name, dict or instance of an integrator; one that gives whole pictures only, such as ptracer, knows "
-        "no layers, edges, motion or depth of field",
+        "name, dict or instance of an integrator; one for whole images, such as ptracer, has no layers, "
+        "edges, motion or depth of field",
         "the scene's own",
     )
     sensor: int = option(0, integer(0, 65535), "number of the sensor, in a scene that has several")
     on_round: Callable[[RoundPicture], object] | None = option(
-        None, FUNCTION, "called after each round of rays with a RoundPicture; stops by returning False"
+        None, FUNCTION, "called after each round with a RoundPicture; stops the render by returning False"
     )
     spp: int | None = option(
         None,
         integer(1, 65536),
-        "rays for each sample, where the integrator is random; aamode=noise: mean of a pixel",
+        "samples per lattice point, where the integrator is random; aamode=noise: mean per pixel",
         "1",
     )
     count_rays: bool = option(False, SWITCH._replace(form=""), "count mirror and shadow rays")
@@ -218,7 +218,7 @@ class RenderSettings:
     progress: Progress | None = option(
         None,
         instance(Progress, "a rendering.progress.Progress"),
-        "receives the plan, the stages and their progress",
+        "receives the plan and the progress of its stages",
     )
 
     def __post_init__(self) -> None:
@@ -240,14 +240,14 @@ class RenderSettings:
 
     @property
     def error(self) -> Target | None:
-        """The error to render to."""
+        """Error target of the render, None without one."""
         return self.target if isinstance(self.target, Target) else None
 
     def goal(self, stated: Goal | None = None) -> Goal | None:
-        """The goal of rounds of rays; None for a render without rounds.
+        """Return the goal of an adaptive render; None for a render without rounds.
 
-        ``stated``: what the scene's integrator says, for where no option says how many rays a pixel gets.
-        Raises ``UsageError`` for too few rays.
+        ``stated``: the goal of the scene's integrator, used where no option sets samples per pixel. Raises
+        ``UsageError`` for too few samples.
         """
         metric = self.metric or METRIC_NAMES[0]
         if self.error is not None:
@@ -256,7 +256,7 @@ class RenderSettings:
             mean = self.spp or 1
             if mean < MIN_SPP:
                 raise UsageError(
-                    f"aamode=noise: give the mean of a pixel's rays as spp, {MIN_SPP} or more, or a target"
+                    f"aamode=noise: give the mean samples per pixel as spp, {MIN_SPP} or more, or a target"
                 )
             return Goal(None, min(mean, self.maxspp or mean), self.maxseconds, metric, self.denoise)
         if stated is None or self.aamode is not None or self.spp is not None:
@@ -268,7 +268,7 @@ class RenderSettings:
         )
 
     def model(self) -> dict[str, Any]:
-        """The options given about a model and its view, as ``obj.obj_scene`` takes them.
+        """Return the options given for a model and its view, as ``obj.obj_scene`` takes them.
 
         Raises ``UsageError`` for a view that shows nothing.
         """
@@ -281,9 +281,9 @@ class RenderSettings:
         return {name: value for name, value in given.items() if value is not None}
 
     def focus(self, distance: float | None, reach: float) -> tuple[float | None, float]:
-        """The distance in focus, None for no depth of field, and half of the sharp range, in scene units.
+        """Return the focal distance, None for no depth of field, and half of the sharp range, in scene units.
 
-        ``distance`` and ``reach``: what the scene suggests.
+        ``distance`` and ``reach``: the scene's defaults.
         """
         if self.focaldist is not None:
             distance = self.focaldist
