@@ -56,7 +56,7 @@ class Path:
     bounces: mi.UInt32  # mirror rays traced
     shadow_rays: mi.UInt32  # shadow rays traced
     active: mi.Bool  # paths that go on
-    sampler: mi.Sampler | None  # for lights that are no points
+    sampler: Any  # None where all lights are points
 
 
 @dataclass
@@ -65,7 +65,7 @@ class Sums:
 
     radiance: mi.UnpolarizedSpectrum
     shadow_rays: mi.UInt32
-    sampler: mi.Sampler | None
+    sampler: Any  # None where all lights are points
 
 
 class MrtWhitted(mi.SamplingIntegrator):

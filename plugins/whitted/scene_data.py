@@ -76,12 +76,12 @@ class SceneData:
         self.errors = traced.errors
         self.spheres = traced.spheres
         self.lights = kept("lights", (now.light_part, plan.lights), _lights, reading, plan)
-        key = now.light_part, plan.light_buffers, *self._shape_key
-        self.light_buffers = kept("light buffers", key, _light_buffers, reading, plan, traced)
-        key = now.eye, plan.eye_buffer, *self._shape_key
-        self.eye_buffer = kept("eye buffer", key, _eye_buffer, reading, plan, traced)
-        key = now.shape_part, now.material_part, plan.merged
-        self.merged = kept("merged", key, _material_table, reading, plan)
+        light_key = now.light_part, plan.light_buffers, *self._shape_key
+        self.light_buffers = kept("light buffers", light_key, _light_buffers, reading, plan, traced)
+        eye_key = now.eye, plan.eye_buffer, *self._shape_key
+        self.eye_buffer = kept("eye buffer", eye_key, _eye_buffer, reading, plan, traced)
+        material_key = now.shape_part, now.material_part, plan.merged
+        self.merged = kept("merged", material_key, _material_table, reading, plan)
         self.path_bound = _path_bound(reading.facts, plan)
         self.ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
         self.ray_flags |= +mi.RayFlags.dPdUV if plan.tangents else 0
@@ -115,7 +115,7 @@ class SceneData:
             pi = self.bvh.ray_intersect_preliminary(ray, plan.coherent, active)
             found = active & pi.is_valid()
             differentiable = self.scene.shapes_grad_enabled() or dr.grad_enabled(ray)
-            if plan.spheres == "table" and not differentiable:
+            if self.spheres is not None and plan.spheres == "table" and not differentiable:
                 si, scale = self.spheres.interaction(pi, ray, found)
             else:
                 si = pi.compute_surface_interaction(ray, self.ray_flags, found)

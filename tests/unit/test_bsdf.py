@@ -351,22 +351,6 @@ def test_attributes_are_all_parameters(variant):
         assert np.all(np.ravel(b.eval_attribute("reflectance", si)) == 0)
 
 
-@in_variants
-def test_parameters_can_be_updated(variant):
-    wi, wo = lobe_pairs(20, 0.3)
-    b = bsdf(alpha=0.1, int_ior=1.5)
-    values = {"alpha": 0.3, "int_ior": 2.0, "ext_ior": 1.1}
-    values |= {"diffuse_reflectance": 0.2, "specular_reflectance": 0.7}
-    parameters = mi.traverse(b)
-    assert {key.removesuffix(".value") for key in dict(parameters)} == set(values)
-    for key in dict(parameters):
-        parameters[key] = values[key.removesuffix(".value")]
-    parameters.update()
-    expected = evaluate(bsdf(**values), wi, wo)
-    for found, value in zip(evaluate(b, wi, wo), expected, strict=True):
-        assert_allclose(found, value, rtol=1e-6)
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_mirror_reflectance_is_ks_times_fresnel(form):
     b = colored(int_ior=1.7, fresnel=form)
