@@ -93,8 +93,8 @@ class Sphere:
 class Axial:
     """A solid of revolution along z from 0 to 1, with a radius of 1 at z = 1: a side, and discs at its ends.
 
-    Its side is straight: the radius is 1 at z = 1 and grows by ``slope``, 0 or 1. A kind with another profile
-    overrides ``surface`` and ``derivatives``, which compute normals from that slope.
+    Its side is straight: its radius grows by ``slope``, 0 or 1, and the hull of both ``ends`` bounds it. A
+    kind with another profile overrides ``surface`` and ``derivatives``, and has ends whose hull contains it.
 
     Texture coordinates: u = azimuth / 2π in [0, 1), v = 1 - z on the side, the unit square around a disc.
     """
