@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from cases import Cases, but_slow
 from nodes import rgb
+from scipy import stats
 from unit import specimens
 from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import runtime
+from mrt_mitsuba.validation.laws import bsdf_samples
 from mrt_mitsuba.validation.laws.bsdf import LAWS
 from mrt_mitsuba.validation.studies import power
 
@@ -247,6 +249,22 @@ def test_wrong_derivatives_are_said_to_mislead_optimisations(name):
     law = mrt.check_bsdf({"type": name, **parameters}, quick=True, only=["gradients"]).laws["gradients"]
     assert not law.holds
     assert "biased derivatives: optimisations by AD go wrong" in law.why
+
+
+def test_the_smallest_p_value_is_corrected_for_all_tests(monkeypatch):
+    asked = []
+
+    def chi_square(*_):
+        asked.append(1)
+        return np.tile([30.0, 10.0], (6, 1)), (0.0, 0.1, 0.0, 0.1, 1)
+
+    monkeypatch.setattr(bsdf_samples, "chi_square", chi_square)
+    law = mrt.check_bsdf({"type": "diffuse"}, quick=True, only=["sampling"]).laws["sampling"]
+    (cells,) = (part for part in law.parts if part.criterion == "cells")
+    angles = len(asked)
+    least = min(stats.chi2.sf(30, 10), stats.chi2.sf(30 * angles, 10 * angles))  # each angle, and all of them
+    assert cells.measured == pytest.approx(1 - (1 - least) ** (6 * (angles + 1)))
+    assert f"at {angles} angles" in cells.name
 
 
 LAMBERT = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide

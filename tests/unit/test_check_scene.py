@@ -142,7 +142,7 @@ def test_a_scene_is_checked_as_it_is_rendered(monkeypatch):
     ball = {"type": "scene", "ball": {"type": "sphere"}, "sensor": {"type": "perspective"}}
     mrt.check_scene(ball, integrator="direct", width=20, height=30)
     assert seen == [("SamplingIntegrator", [80, 30]), ("DirectIntegrator", [20, 30])]
-    with pytest.raises(mrt.UsageError, match="widht"):
+    with pytest.raises(TypeError, match="widht"):
         mrt.check_scene(3, widht=80)
 
 
@@ -242,7 +242,10 @@ def test_each_mistake_fails_its_own_laws(mistake):
     mi.register_emitter("sky", changed_sky({MISTAKES[mistake].kind: MISTAKES[mistake].change}))
     if mistake in IN_A_SCENE:
         assert failed({"type": "sky"}) == laws
-    assert set(mrt.check_emitter({"type": "sky"}, quick=True).failed) == laws
+    found = mrt.check_emitter({"type": "sky"}, quick=True)
+    assert set(found.failed) == laws
+    for law in (found.laws[name] for name in found.failed if found.laws[name].snippet):
+        assert "a sample of" in law.output and "Error" not in law.output, law.output
     loaded = mi.load_dict({"type": "sky"})
     assert set(mrt.check_emitter(loaded, quick=True, seed=1).failed) == laws
 

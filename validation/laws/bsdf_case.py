@@ -14,15 +14,15 @@ import numpy as np
 from . import probe
 from .case import Case, Given
 from .law import Skip, UsageError
-from .probe import ROUNDED, Array, Function, Lanes, Probe, excess, is_scalar, joined, unit
-from .sphere import DEPTH, POINTS, Cells, encode, integrate
+from .probe import DIRECTION_EPS, Array, Function, Lanes, Probe, excess, is_scalar, joined, unit
+from .sphere import MAX_LEVEL, POINTS_PER_CELL, Cells, encode, integrate
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
 QUICK_ANGLES = (0, 50, 85, 140)
-FIT = 5e-3  # the rational fits of Smith's G₁ in use are off by up to 0.35 %, and the densities with them
-POINTWISE = 2e-3  # relative, beyond what rounding explains
-OVERLOOKED = 0.02  # share of samples about which quadrature may know nothing; of lobes it resolves, 0.001
-NARROW = 16 * ROUNDED  # width of a lobe that rounded directions do not resolve
+G1_FIT_ERROR = 5e-3  # rational fits of Smith's G₁ are off by up to 0.35 %, and densities with them
+POINTWISE_TOL = 2e-3  # relative, beyond what rounding explains
+MAX_UNRESOLVED_SHARE = 0.02  # of samples in cells that quadrature does not resolve; usually 0.001
+MIN_LOBE_WIDTH = 16 * DIRECTION_EPS  # width of a lobe that rounded directions do not resolve
 
 
 @dataclass
@@ -95,10 +95,10 @@ class BsdfCase(Case, Probe):
         most = max(len(view.density) // 4000, 8)
         cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
         crowd = cells.counts(encode(view.pilot))
-        crowded = (crowd * ((cells.level == DEPTH) & (crowd > 4 * most))).sum()
+        crowded = (crowd * ((cells.level == MAX_LEVEL) & (crowd > 4 * most))).sum()
         # at the normal, all azimuths of the finest cells are one place
         radius = np.hypot(*view.pilot.T[:2])
-        centre = (radius < np.sqrt(2) * 0.5**DEPTH).sum()
+        centre = (radius < np.sqrt(2) * 0.5**MAX_LEVEL).sum()
         if max(crowded, centre) > 0.01 * len(view.pilot):  # samples are closer together than the finest cells
             return None
         integrals = integrate(self.density_at(view), cells, self.rng, view.codes, view.count)
@@ -106,9 +106,9 @@ class BsdfCase(Case, Probe):
         density_there = view.density[-view.count :]
         weights = 1 / (view.count * density_there[density_there > 0])
         covered = integrals.counts(view.codes, weights)
-        coarse = covered * POINTS < 2 * integrals.solid_angle
+        coarse = covered * POINTS_PER_CELL < 2 * integrals.solid_angle
         overlooked = integrals.counts(view.codes)[coarse].sum() / view.count
-        known = integrals.mean.sum() > view.share or overlooked < OVERLOOKED
+        known = integrals.mean.sum() > view.share or overlooked < MAX_UNRESOLVED_SHARE
         return integrals if known else None
 
     @cached_property
@@ -206,7 +206,7 @@ def narrow(s: Lanes) -> Array:
     sharpness = s.pdf / abs(s.wi[:, 2])
     for lobe in np.unique(s.lobe[drawn]):
         part = drawn & (s.lobe == lobe)
-        too_narrow |= part & (np.median(sharpness[part]) > NARROW**-2)
+        too_narrow |= part & (np.median(sharpness[part]) > MIN_LOBE_WIDTH**-2)
     return too_narrow
 
 

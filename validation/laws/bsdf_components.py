@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .bsdf_case import POINTWISE, BsdfCase, pair_errors, parameters
+from .bsdf_case import POINTWISE_TOL, BsdfCase, pair_errors, parameters
 from .bsdf_snippets import SAMPLE, VALUE
 from .faults import VEIL, larger, larger_by, member, of_sample
 from .law import SIGMAS, Outcome, Skip, finds, measures, most, number_of
@@ -99,7 +99,7 @@ def components(law: Outcome, case: BsdfCase) -> None:
 
 
 def _component(law: Outcome, case: BsdfCase, i: int, flag: int, value: Array) -> int:
-    """Hold values and samples of a component to its flags; the number of sides of these that are black."""
+    """Check values and samples of a component against its flags; return how many sides of these are black."""
     p = case.pairs
     lit = (value != 0).any(axis=1)
     bad = lit & np.isfinite(value).all(axis=1) & ~_allowed(flag & ~mi.BSDFFlags.Delta, p)
@@ -163,14 +163,14 @@ STRAIGHT = "integrators follow shadow rays through surfaces by it; where it is 0
 @measures(
     each=most(
         "eval_null_transmission() against probability x weight of a sample straight through, relative",
-        POINTWISE,
+        POINTWISE_TOL,
         STRAIGHT,
         NULL,
     ),
     mean=most(
         f"eval_null_transmission() against the mean weight of samples straight through, beyond {SIGMAS} "
         "standard errors",
-        POINTWISE,
+        POINTWISE_TOL,
         STRAIGHT,
         NULL,
     ),
@@ -206,7 +206,7 @@ def by_variant(size, value, *_):
 @measures(
     same=most(
         "value and density in {other} against {here}, relative, beyond rounding",
-        POINTWISE,
+        POINTWISE_TOL,
         "the same formula",
         VALUE,
     )

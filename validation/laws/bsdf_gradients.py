@@ -12,11 +12,11 @@ from . import probe
 from .bsdf_case import BsdfCase, changed, live, narrow, parameters
 from .faults import GLOSS, of_weight
 from .law import MIN_QUANTILE_ERRORS, SIGMAS, Outcome, Skip, finds, measures, most, number_of
-from .probe import ROUNDED, Array, Probe, as_mitsuba, context, excess
+from .probe import DIRECTION_EPS, Array, Probe, as_mitsuba, context, excess
 
-GRADIENT = 2e-2  # relative; differences of two widths agree better
-IN_THE_MEAN = 5e-2  # where outlines of lobes move, derivatives of samples miss them
-WIDTHS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of differences, over the parameter
+DERIVATIVE_TOL = 2e-2  # relative; differences of two widths agree better
+MEAN_DERIVATIVE_TOL = 5e-2  # where outlines of lobes move, derivatives of samples miss them
+DIFFERENCE_STEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  # of differences, over the parameter
 BIASED = "biased derivatives: optimisations by AD go wrong"
 DETACHED = f"{BIASED}; integrators follow a direction as a constant, and its density must not change, either"
 
@@ -65,7 +65,7 @@ def steeper(size, value, *_):
 @measures(
     values=most(
         "derivative of values by {key}{how}, relative, beyond the error of differences",
-        GRADIENT,
+        DERIVATIVE_TOL,
         f"{BIASED}; differences of two widths agree better, or the difference is allowed for",
         DERIVATIVE,
     ),
@@ -78,19 +78,19 @@ def steeper(size, value, *_):
     mean=most(
         "mean derivative of weights by {key}, of directions that move with it, against that of "
         f"values, relative, beyond {SIGMAS} standard errors",
-        IN_THE_MEAN,
+        MEAN_DERIVATIVE_TOL,
         DETACHED,
         SAMPLED,
     ),
     weights=most(
         "derivative of weights by {key} against that of eval() over a constant density, relative",
-        GRADIENT,
+        DERIVATIVE_TOL,
         DETACHED,
         SAMPLED,
     ),
     reached=most(
         "values that loading with another {key} changes, but params.update() does not, relative",
-        GRADIENT,
+        DERIVATIVE_TOL,
         f"{BIASED}; parameters_changed() has to compute anew what is made of parameters",
         UPDATE,
     ),
@@ -117,7 +117,7 @@ def gradients(law: Outcome, case: BsdfCase) -> None:
 
 
 def _attached(law: Outcome, case: BsdfCase, key: str) -> bool:
-    """Hold the derivative by one parameter to differences; return False where it is detached, and wrong."""
+    """Check the derivative by one parameter against differences; return whether it is attached, or right."""
     few = case.lit
     (derivative,), attached = _derivatives(case, key, len(few.wi), lambda: [_values(case)])
     broken = ~np.isfinite(derivative)
@@ -138,7 +138,7 @@ def _attached(law: Outcome, case: BsdfCase, key: str) -> bool:
     how = "" if attached else " (detached)"
     law.check("values", measured, few[i], key=key, how=how)
     law.check("broken", broken, few, key=key)
-    return attached or measured <= GRADIENT
+    return attached or measured <= DERIVATIVE_TOL
 
 
 def _derivatives(
@@ -157,7 +157,7 @@ def _derivatives(
 
 
 def _sampled(law: Outcome, case: BsdfCase, key: str) -> None:
-    """Hold the derivative of samples' weights to that of values over a density that does not change.
+    """Check the derivative of samples' weights against that of values over a constant density.
 
     Integrators follow a sample as a constant direction. Where one moves with the parameter, its weight may
     change otherwise: only means over smooth light are then the same.
@@ -179,7 +179,7 @@ def _sampled(law: Outcome, case: BsdfCase, key: str) -> None:
     s = case.sample(at)
     counts = live(s, *case.both(s)) & ~narrow(s)
     counts &= np.isfinite(derivative) & np.isfinite(expected) & (abs(s.wi[:, 2]) > 0.05)
-    counts &= (abs(s.wo[:, 2]) > 0.05) & (s.pdf < (1024 * ROUNDED) ** -2)  # a rounding shows
+    counts &= (abs(s.wo[:, 2]) > 0.05) & (s.pdf < (1024 * DIRECTION_EPS) ** -2)  # a rounding shows
     if not attached or counts.sum() < 100:
         return
     apart = np.where(counts, derivative - expected, 0)
@@ -248,9 +248,9 @@ def _differences(case: BsdfCase, key: str) -> tuple[Array, Array]:
             return np.array(_values(case), np.float64)
 
     here = at(0.0)
-    after = np.array([at(step) for step in WIDTHS])
-    before = np.array([at(-step) for step in WIDTHS])
-    across = 2 * np.array(WIDTHS)[:, None]
+    after = np.array([at(step) for step in DIFFERENCE_STEPS])
+    before = np.array([at(-step) for step in DIFFERENCE_STEPS])
+    across = 2 * np.array(DIFFERENCE_STEPS)[:, None]
     slopes = (after - before) / across
     bent = abs(after - 2 * here + before)
     sides = np.where(bent <= 0.25 * abs(here), bent / across, np.inf)

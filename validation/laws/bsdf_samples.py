@@ -12,7 +12,7 @@ import numpy as np
 from scipy import stats
 
 from . import plots, probe
-from .bsdf_case import FIT, POINTWISE, BsdfCase, View, live, narrow
+from .bsdf_case import G1_FIT_ERROR, POINTWISE_TOL, BsdfCase, View, live, narrow
 from .bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
 from .faults import (
     DEGREE,
@@ -39,7 +39,7 @@ from .law import (
 )
 from .probe import BEYOND, Array, Lanes, context, excess, is_scalar, joined
 from .sphere import (
-    SMALL,
+    SMALL_CELL_LEVEL,
     Cells,
     chi_square,
     encode,
@@ -52,7 +52,7 @@ NUDGED = """for moved in np.eye(3) * 2.0**-18 * np.where(np.array(u) < 0.5, 1, -
     print("random numbers moved by", moved, "direction:", bsdf.sample(ctx, si, a, mi.Point2f(b, c))[0].wo)
 """
 UNRESOLVED = "neither float32 directions nor the samples resolve the lobe"
-BROAD = 20.0  # a density per steradian: lobes are then wide against a degree
+MAX_BROAD_DENSITY = 20.0  # a density per steradian: lobes are then wide against a degree
 NUDGE = 2.0**-18  # of a random number: a hundred roundings of the direction
 PLOTTED = 5  # level of the cells of a plot
 GRAZING = (83, 86, 88, 89.5, 94, 92, 90.5)  # degrees
@@ -100,17 +100,17 @@ def stairs_of(size, u):
 @finds("integral", "density too large everywhere", 0.01, pdf=larger)
 @measures(
     cells=p_value(
-        "least chance of counts at {angles} angles if samples follow pdf(), for their number", CELL
+        "smallest p-value of a chi-square test at {angles} angles, corrected for their number", CELL
     ),
     integral=most(
-        f"integral of pdf() less the share of samples it stands for, beyond {SIGMAS} standard errors",
-        FIT,
+        f"integral of pdf() minus the share of samples that it describes, beyond {SIGMAS} standard errors",
+        G1_FIT_ERROR,
         FITS,
         WHOLE,
     ),
-    small=p_value("chance of such counts of all angles in cells of a degree, for their number", CELL),
+    small=p_value("smallest p-value of counts in cells of one degree, corrected for their number", CELL),
     slices=p_value(
-        "chance of such counts of all angles in slices of a degree or two, for their number", WHOLE
+        "smallest p-value of counts in slices of one or two degrees, corrected for their number", WHOLE
     ),
     still=share_of(
         "share of samples that stay where two of their random numbers move by 2^-18",
@@ -148,7 +148,7 @@ def sampling(law: Outcome, case: BsdfCase) -> None:
     worst = []
     beyond = []
     for view, cells in judged:
-        test, cell = chi_square(cells, view.codes, view.count, 0.5 * FIT)
+        test, cell = chi_square(cells, view.codes, view.count, 0.5 * G1_FIT_ERROR)
         tests.append(test)
         worst.append(cell)
         variance = view.share * (1 - view.share) / view.count + cells.variance.sum()
@@ -159,7 +159,7 @@ def sampling(law: Outcome, case: BsdfCase) -> None:
     i = chances[:-1].min(axis=1).argmin()
     law.check("cells", chance, at[i], cell=worst[i], angles=len(judged))
     law.check("integral", np.maximum(beyond, 0), at)
-    broad = [view for view in case.views if 0 < view.density.max() < BROAD]
+    broad = [view for view in case.views if 0 < view.density.max() < MAX_BROAD_DENSITY]
     if broad and not case.quick and not is_scalar():
         _in_small_cells(law, case, broad)
     if not law.holds:
@@ -173,12 +173,14 @@ def _densities(case: BsdfCase, view: View) -> Callable[[], Any]:
     cells = Cells.uniform(PLOTTED)
     r, turn = cells.corner
     place = cells.below.astype(int), (r / cells.width).astype(int), (turn / cells.width).astype(int)
-    seen = cells.counts(encode(view.samples.wo[view.density > 0])) / len(view.density)
-    expected, _ = cells.integrals(case.density_at(view), case.rng)
+    count = len(view.density)
+    expected, _ = cells.expected(case.density_at(view), count, case.rng)
     grids = np.zeros((2, 2, 2**PLOTTED, 2**PLOTTED))
-    grids[0][place] = seen / cells.solid_angle
-    grids[1][place] = expected[:, 0] / cells.solid_angle
-    return partial(plots.density, *grids, np.degrees(np.arccos(view.at.wi[2])))
+    grids[0][place] = cells.counts(encode(view.samples.wo[view.density > 0]))
+    grids[1][place] = expected
+    grids[(slice(None), *place)] /= count * cells.solid_angle
+    seen, expected = grids
+    return partial(plots.density, seen, expected, float(np.degrees(np.arccos(view.at.wi[2]))))
 
 
 def _nudged(law: Outcome, case: BsdfCase) -> None:
@@ -189,20 +191,20 @@ def _nudged(law: Outcome, case: BsdfCase) -> None:
         moved = drawn.u + number * np.where(drawn.u < 0.5, NUDGE, -NUDGE)
         wo = case.sample(drawn.having(u=moved)).wo
         changes += (wo != drawn.wo).any(axis=1)
-    smooth = drawn.lit & ~drawn.delta & (drawn.pdf < BROAD) & drawn.wo.any(axis=1)
+    smooth = drawn.lit & ~drawn.delta & (drawn.pdf < MAX_BROAD_DENSITY) & drawn.wo.any(axis=1)
     if smooth.sum() >= MIN_QUANTILE_ERRORS:
         law.check("still", (changes < 2)[smooth], drawn[smooth])
 
 
 def _in_small_cells(law: Outcome, case: BsdfCase, views: list[View]) -> None:
-    cells = Cells.uniform(SMALL)
+    cells = Cells.uniform(SMALL_CELL_LEVEL)
     counts = []
     for view in views:
         seen = cells.counts(encode(view.samples.wo[view.density > 0]))
         expected = cells.expected(case.density_at(view), len(view.density), case.rng)
         counts.append([seen, *expected])
     view = max(views, key=lambda v: v.at.wi[2])
-    hold_small(law, cells, np.sum(counts, axis=0), FIT, view.at)
+    hold_small(law, cells, np.sum(counts, axis=0), G1_FIT_ERROR, view.at)
 
 
 @larger_by
@@ -222,11 +224,11 @@ def in_stairs(u):
     sample=of_sample(member("pdf", smaller)),
 )
 @measures(
-    density=most(f"density of a sample against pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
-    weight=most(f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE, AGAIN, SAMPLE),
+    density=most(f"density of a sample against pdf(), {BEYOND}", POINTWISE_TOL, AGAIN, SAMPLE),
+    weight=most(f"weight of a sample against eval() / pdf(), {BEYOND}", POINTWISE_TOL, AGAIN, SAMPLE),
     discrete=most(
         f"probability of a single direction (delta) less its share, beyond {SIGMAS} standard errors",
-        POINTWISE,
+        POINTWISE_TOL,
         "a count",
         WHOLE,
     ),
@@ -273,13 +275,13 @@ def too_bright(size, value, *_):
 @measures(
     largest=most(
         f"largest albedo, less {SIGMAS} standard errors",
-        1 + FIT,
+        1 + G1_FIT_ERROR,
         "no more light leaves than arrives; 0.5 % for fits of G1",
         WHOLE,
     ),
     apart=most(
         f"albedo by quadrature of eval() against mean weight, relative, beyond {SIGMAS} standard errors",
-        2 * FIT,
+        2 * G1_FIT_ERROR,
         "0.5 % for fits of G1 in the density",
         WHOLE,
     ),
@@ -306,8 +308,7 @@ def energy(law: Outcome, case: BsdfCase) -> None:
         s = case.sample(view.samples, mode)
         means.append(_mean(s.weight))
         # where values are NaN, the law ``finite`` says so
-        known = cells is not None and view.holes < 0.01
-        difference, albedo = _apart(case, view, cells, s) if known else (0.0, np.nan)
+        difference, albedo = _apart(case, view, cells, s) if cells and view.holes < 0.01 else (0.0, np.nan)
         apart.append(difference)
         quadrature.append(albedo)
     surely = [(mean - SIGMAS * error).max() for mean, error in means]
@@ -316,8 +317,9 @@ def energy(law: Outcome, case: BsdfCase) -> None:
     if any(case.cells):
         law.check("apart", apart, case.incidence)
     if not law.holds:
-        rows = [np.max(means, axis=2)[:, i] for i in (0, 1)]
-        law.plot = partial(plots.albedo, np.degrees(np.arccos(at.wi[:, 2])), *rows, np.array(quadrature))
+        albedos, errors = np.max(means, axis=2).T
+        angles = np.degrees(np.arccos(at.wi[:, 2]))
+        law.plot = partial(plots.albedo, angles, albedos, errors, np.array(quadrature))
 
 
 def _mean(weight: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ density = dr.mean(bsdf.pdf(ctx, si, wo) * 2 * r)[0] * (r1 - r0) * (phi1 - phi0)
 print("share of samples in the cell:", dr.count(inside)[0] / n, "pdf() says:", density)
 """
 WHOLE = f"""{DRAW}wo = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-print("share of samples that pdf() stands for:", dr.count(smooth)[0] / n)
+print("share of samples that pdf() describes:", dr.count(smooth)[0] / n)
 print("integral of pdf() by uniform directions:", dr.mean(bsdf.pdf(ctx, si, wo))[0] * 4 * dr.pi)
 print("albedo by samples:", dr.mean(weight, axis=1))
 print("without lobes of one direction:", dr.mean(dr.select(delta, 0, weight), axis=1))

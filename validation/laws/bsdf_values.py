@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import noise, plots, probe
-from .bsdf_case import POINTWISE, BsdfCase, changed, parameters
+from .bsdf_case import POINTWISE_TOL, BsdfCase, changed, parameters
 from .bsdf_snippets import SAMPLE, VALUE
 from .case import READS, READS_WHY, judge_many, reads_checked
 from .faults import (
@@ -120,11 +120,16 @@ def by_importance(ctx, *_):
 @finds("single", "more light through glass from one side", 3e-3, nested=GLASS, value=from_one_side)
 @finds("single_modes", "more light through glass by importance", 3e-3, nested=GLASS, value=by_importance)
 @measures(
-    swapped=most(f"f(wi, wo) against f(wo, wi), {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY),
+    swapped=most(f"f(wi, wo) against f(wo, wi), {BEYOND}", POINTWISE_TOL, EITHER_WAY, RECIPROCITY),
     modes=most(
-        f"f in the mode of radiance against that of importance, {BEYOND}", POINTWISE, EITHER_WAY, RECIPROCITY
+        f"f in the mode of radiance against that of importance, {BEYOND}",
+        POINTWISE_TOL,
+        EITHER_WAY,
+        RECIPROCITY,
     ),
-    medium=most("index of refraction of reflected samples, less 1", probe.ROUNDED, "one medium", SAMPLE),
+    medium=most(
+        "index of refraction of reflected samples, less 1", probe.DIRECTION_EPS, "one medium", SAMPLE
+    ),
     returns=at_least(
         "share of single directions (delta) that the way back returns to",
         0.05,
@@ -133,13 +138,13 @@ def by_importance(ctx, *_):
     ),
     single=most(
         f"probability x weight x eta^2 of a single direction (delta) against the way back, {BEYOND}",
-        POINTWISE,
+        POINTWISE_TOL,
         EITHER_WAY,
         THERE_AND_BACK,
     ),
     single_modes=most(
         "weight of a single direction (delta) x eta^2 against the mode of importance, relative",
-        POINTWISE,
+        POINTWISE_TOL,
         EITHER_WAY,
         THERE_AND_BACK,
     ),
@@ -281,7 +286,7 @@ def _ends(key: str, number: float) -> tuple[float, float]:
 
 
 def _finite(law: Outcome, case: BsdfCase, at: Lanes, setting: tuple[str, float] | None = None) -> bool:
-    """Hold the faults of values, or those of samples where values have none; return whether all is sound."""
+    """Check values, or samples where values have no fault; return whether all is sound."""
     value, pdf = case.both(at)
     s = case.sample(at)
     length = np.linalg.norm(np.float64(s.wo), axis=1)
@@ -342,7 +347,7 @@ def stairs_on_slope(size, value, ctx, wi, wo):
 @measures(
     lost=Criterion(
         0.9,
-        "noise of {function}() over that of 8 roundings with rounded directions, 9 in 10",
+        "rounding noise of {function}() over that of 8 roundings and of rounded directions, 90th percentile",
         noise.MAX_NOISE,
         "sound formulas stay below 1.6; beyond, digits are lost",
         NOISE,

@@ -124,7 +124,7 @@ class Case:
                 first.add(PREAMBLES[package][0])
                 later.add(PREAMBLES[package][1])
             elif module == "__main__":
-                later.add(f"# register {self.name!r} here")
+                later.add("# register your plugin here")
             elif package not in ("builtins", "mitsuba", "drjit"):
                 later.add(f"import {module}  # registers its plugins")
         return sorted(first), sorted(later)
@@ -294,6 +294,13 @@ params.update()
     "component": "ctx.component = {component}\n",
     "wo": "wo = mi.Vector3f({wo})\ndr.make_opaque(wo)\n",
     "u": "u = {u}\nbs, weight = bsdf.sample(ctx, si, u[0], mi.Point2f(u[1], u[2]))\n",
+    "point": """
+{placed}
+it = dr.zeros(mi.SurfaceInteraction3f)
+if mi.is_spectral:
+    it.wavelengths = type(it.wavelengths)(450, 500, 550, 600)
+it.p = mi.Point3f({point})
+""",
     "o": """
 scene = mi.load_dict({{"type": "scene", "shape": shape}}) if isinstance(shape, mi.Shape) else shape
 o, d = mi.Point3f({o}), mi.Vector3f({d})

@@ -33,24 +33,36 @@ from .page import Check
 from .probe import BEYOND, Array, Lanes, excess, lanes, method
 from .shape_case import CONE, View, alone
 from .sphere import (
-    SMALL,
+    SMALL_CELL_LEVEL,
     Cells,
     chances_of,
     chi_square,
     encode,
     hold_small,
     integrate,
-    least_of,
+    p_value_of_least,
 )
 
 REEVALUATION_TOL = 1e-3  # relative: the same formula, evaluated once more
-DIRECTION_TOL = 4 * probe.ROUNDED  # a direction passes through angles, a transform, and back
+DIRECTION_TOL = 4 * probe.DIRECTION_EPS  # a direction passes through angles, a transform, and back
 SPOILS = "one such number spoils a picture"
-LENGTH = 1e-4  # relative: a square root, and the difference of two points
-RETRY_P_VALUE = 1e-3  # chance below which the integral over a cell is made again
+LENGTH_TOL = 1e-4  # relative: a square root, and the difference of two points
+RETRY_P_VALUE = 1e-3  # chance below which the integral over a cell is computed again
 REPEATS = 64
-BATCH = 256  # cells of which it is made again at a time
+BATCH = 256  # cells that are computed again at a time
 MAX_UNSAMPLED_LIGHT = 5e-5  # share of the light: a fifth of a cone of 3 degrees
+
+
+SAMPLED = """ds, weight = emitter.sample_direction(it, mi.Point2f({number}))
+print("a sample of", ds.d, "distance", ds.dist, "density", ds.pdf, "weight", weight)
+print("there, pdf_direction():", emitter.pdf_direction(it, ds), "and", emitter.eval_direction(it, ds))
+print("the point:", ds.p, "and by direction and distance:", it.p + ds.dist * ds.d)
+it.wi = -ds.d
+print("eval(), if it is infinitely far:", emitter.eval(it))
+"""
+BALL = '"ball": {"type": "sphere"}, "light": emitter'
+SQUARE = '"square": {"type": "rectangle", "to_world": place, "light": emitter}'
+PLACED = "place = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 180)"
 
 
 def check_emitter(
@@ -80,7 +92,8 @@ class EmitterCase(Case):
 
     def __init__(self, given: Given, quick: bool, seed: int, scene: mi.Scene | None = None) -> None:
         super().__init__(given, quick, seed)
-        if isinstance(self.plugin, mi.Shape) and self.plugin.emitter() is not None:
+        self.is_shape = isinstance(self.plugin, mi.Shape) and self.plugin.emitter() is not None
+        if self.is_shape:
             scene = mi.load_dict({"type": "scene", "shape": self.plugin})
             self.plugin = self.plugin.emitter()
         if not isinstance(self.plugin, mi.Emitter):
@@ -155,7 +168,7 @@ class EmitterCase(Case):
             if not type(self.plugin).__module__.startswith("mitsuba"):
                 raise
             raise Skip("directions cannot be sampled") from error
-        s = probe.named("p d dist pdf again delta weight value", columns).having(point=points, u=u)
+        s = probe.named("p d dist pdf again delta weight value", columns).having(point=points, number=u)
         s.lit = (s.weight != 0).any(axis=1)
         return s
 
@@ -188,6 +201,19 @@ class EmitterCase(Case):
         return lanes(call, ("Point3f", o), ("Vector3f", d))
 
     @cached_property
+    def placed(self) -> str:
+        """Lines of a program that put the emitter into a scene."""
+        if self.description is None:
+            return "# it is in a scene"
+        place = ""
+        nodes = '"shape": emitter' if self.is_shape else BALL
+        if not self.is_shape and mi.has_flag(self.plugin.flags(), mi.EmitterFlags.Surface):
+            place = PLACED
+            nodes = SQUARE
+        scene = 'scene = mi.load_dict({"type": "scene", ' + nodes + "})"
+        return "\n".join([place, scene, "(emitter,) = scene.emitters()"])
+
+    @cached_property
     def surface(self) -> mi.Scene:
         """A scene with the shape of a lamp alone."""
         return alone(self.plugin.get_shape())
@@ -218,7 +244,9 @@ def _seen_from(p: mi.Point3f) -> mi.SurfaceInteraction3f:
 
 @finds("same", "pdf_direction() too large", 3e-3, pdf=larger)
 @measures(
-    same=most(f"density of a direction against pdf_direction(), {BEYOND}", REEVALUATION_TOL, "one number")
+    same=most(
+        f"density of a direction against pdf_direction(), {BEYOND}", REEVALUATION_TOL, "one number", SAMPLED
+    )
 )
 def density(law: Outcome, case: EmitterCase) -> None:
     """The density that a sample states is ``pdf_direction``."""
@@ -226,7 +254,7 @@ def density(law: Outcome, case: EmitterCase) -> None:
     judged = s.lit & ~s.delta
     if not judged.any():
         raise Skip("light comes from single directions (delta), or none was sampled")
-    law.check("same", excess(s.pdf, s.again, case.spread[0]), where=judged)
+    law.check("same", excess(s.pdf, s.again, case.spread[0]), s, where=judged, placed=case.placed)
 
 
 def in_hole(size, d):
@@ -261,11 +289,14 @@ def no_density_of_sample(size, ds, u):
 )
 @measures(
     place=most(
-        "sampled point off the stated direction and distance, relative", LENGTH, "one place, said in two ways"
+        "sampled point off the stated direction and distance, relative",
+        LENGTH_TOL,
+        "one place, said in two ways",
+        SAMPLED,
     ),
-    counts=p_value("chance of such counts if directions follow pdf_direction()"),
-    small=p_value("chance of such counts in cells of a degree, for their number"),
-    slices=p_value("chance of such counts in slices of a degree or two, for their number"),
+    counts=p_value("smallest p-value of a chi-square test of directions, corrected for their number"),
+    small=p_value("smallest p-value of counts in cells of one degree, corrected for their number"),
+    slices=p_value("smallest p-value of counts in slices of one or two degrees, corrected for their number"),
     light=most(
         "light of a lamp by samples against by rays in all directions, relative, beyond "
         f"{SIGMAS} standard errors",
@@ -286,7 +317,7 @@ def sampling(law: Outcome, case: EmitterCase) -> None:
     points = np.float64(case.points)
     scale = abs(s.dist) + abs(points).max(axis=1)
     off = norm(s.p - points - s.dist[:, None] * s.d, axis=1)
-    law.check("place", np.nan_to_num(off / scale), where=s.lit)
+    law.check("place", np.nan_to_num(off / scale), s, where=s.lit, placed=case.placed)
     if case.lamp:
         law.check("light", _by_samples_and_by_rays(case))
     if not case.around:
@@ -327,7 +358,7 @@ def _by_samples_and_by_rays(case: EmitterCase) -> float:
 def _in_small_cells(law: Outcome, case: EmitterCase) -> None:
     """Directions in cells of a degree and in slices, for places that are never sampled."""
     count = case.count(2**21, 2**23)
-    cells = Cells.uniform(SMALL)
+    cells = Cells.uniform(SMALL_CELL_LEVEL)
     rng = np.random.default_rng((case.seed, 3))
     seen = np.zeros(len(cells.start))
     for _ in range(count // 2**20):
@@ -339,7 +370,7 @@ def _in_small_cells(law: Outcome, case: EmitterCase) -> None:
         batch = doubtful[first : first + BATCH]
         again = np.array(cells[np.tile(batch, REPEATS)].expected(case.density, count, rng))
         counts[1:, batch] = again.reshape(2, REPEATS, -1).mean(axis=1)
-        if least_of(chances_of(counts[:, batch], REEVALUATION_TOL), len(counts[0])) < SIGNIFICANCE:
+        if p_value_of_least(chances_of(counts[:, batch], REEVALUATION_TOL), len(counts[0])) < SIGNIFICANCE:
             break  # the law fails, whatever the other cells hold: half of the sky would take half a minute
     hold_small(law, cells, counts, REEVALUATION_TOL)
 
@@ -360,7 +391,9 @@ def _directions(case: EmitterCase, u: Array) -> Array:
 
 @finds("weight", "weight of a sample too large", 3e-3, weight=larger)
 @measures(
-    weight=most(f"weight against eval_direction() / density, {BEYOND}", REEVALUATION_TOL, "one number"),
+    weight=most(
+        f"weight against eval_direction() / density, {BEYOND}", REEVALUATION_TOL, "one number", SAMPLED
+    ),
     seen=most(f"eval() where it is seen against eval_direction(), {BEYOND}", REEVALUATION_TOL, "one number"),
 )
 def weights(law: Outcome, case: EmitterCase) -> None:
@@ -370,7 +403,8 @@ def weights(law: Outcome, case: EmitterCase) -> None:
     counts = s.lit & (s.pdf > 0) & np.isfinite(s.weight).all(axis=1)
     if not counts.any():
         raise Skip("no sample carries light")
-    law.check("weight", excess(s.weight * s.pdf[:, None], s.value, allowed), where=counts)
+    error = excess(s.weight * s.pdf[:, None], s.value, allowed)
+    law.check("weight", error, s, where=counts, placed=case.placed)
     if case.around:
         _, value = case.seen(s.d)
         law.check("seen", excess(value, s.value, allowed), where=counts)
@@ -386,7 +420,7 @@ def weights(law: Outcome, case: EmitterCase) -> None:
 @finds("million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number)
 @measures(
     reads=most(READS, 0, READS_WHY),
-    bad=number_of("samples that are not finite, or negative, or not of unit length", 0, SPOILS),
+    bad=number_of("samples that are not finite, or negative, or not of unit length", 0, SPOILS, SAMPLED),
     million=most(
         "samples of {count} from one point that are not finite, or negative, or whose direction is not of "
         "length 1",
@@ -400,8 +434,8 @@ def finite(law: Outcome, case: EmitterCase) -> None:
         s = case.sample(case.points)
         sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
         length = abs(norm(np.float64(s.d), axis=1) - 1)
-        usable = (length <= LENGTH) & np.isfinite(s.dist) & (s.pdf >= 0)
-        law.check("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable))
+        usable = (length <= LENGTH_TOL) & np.isfinite(s.dist) & (s.pdf >= 0)
+        law.check("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable), s, placed=case.placed)
         judge_many(law, case, partial(_at_random, case))
 
 

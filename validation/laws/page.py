@@ -9,7 +9,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -125,21 +125,16 @@ def frame(checks: Mapping[str, Check], title: str, remarks: Sequence[str] = ()) 
 
 
 def _summary(check: Check) -> dict[str, Any]:
-    laws = {}
-    for law in check.laws.values():
-        criteria = [
-            {
-                "name": part.name,
-                "measured": part.measured,
-                "sense": part.sign,
-                "limit": part.limit,
-                "holds": part.holds,
-                "why": part.note,
-            }
-            for part in law.parts
-        ]
-        laws[law.name] = {"verdict": law.verdict, "skipped": law.skipped, "notes": law.notes}
-        laws[law.name] |= {"criteria": criteria, "snippet": law.snippet, "output": law.output}
+    laws = {
+        law.name: {
+            "verdict": law.verdict,
+            "skipped": law.skipped,
+            "notes": law.notes,
+            "criteria": [asdict(part) | {"holds": part.holds} for part in law.parts],
+            "output": law.output,
+        }
+        for law in check.laws.values()
+    }
     return {
         "passed": check.passed,
         "failed": check.failed,

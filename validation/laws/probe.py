@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 Array = np.ndarray
-ROUNDED = 2.0**-23  # how far a direction is off that a computation returns in float32
-BEYOND = "relative, beyond 8 times what the rounding of directions explains"  # as ``excess`` has it
+DIRECTION_EPS = 2.0**-23  # how far a direction is off that a computation returns in float32
+BEYOND = "relative, beyond 8 times the effect of rounded directions"  # as ``excess`` has it
 Part = TypeVar("Part", bound="Lanes")
 Function = Callable[[Array], Array]
 Call = Callable[..., Any]  # its values are a Dr.Jit array, or several
@@ -283,7 +283,10 @@ def direction(cos: Array | float, phi: Array | float) -> Array:
 
 
 def spread(
-    quantity: Callable[..., Array], directions: Sequence[Array], rng: np.random.Generator, by: float = ROUNDED
+    quantity: Callable[..., Array],
+    directions: Sequence[Array],
+    rng: np.random.Generator,
+    by: float = DIRECTION_EPS,
 ) -> Array:
     """The largest change of a quantity of directions [N, 3] as they move ``by`` so much."""
     base = quantity(*directions)

@@ -1,4 +1,4 @@
-"""``check_scene``: every BSDF, shape and emitter of a scene by its laws, and a hunt for NaN pixels."""
+"""``check_scene``: every BSDF, shape and emitter of a scene by its laws, and a search for bad pixels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .shape import check_shape
 
 Plugin = tuple[str, int, mi.Object]  # its kind, and its number among those of the kind
 MAX_PER_KIND = 6  # plugins of one kind that are checked, spread over all
-MAX_BOUNCES = 12  # bounces that the hunt follows
+MAX_BOUNCES = 12  # bounces that the search follows
 COUNTS = (16, 128, 1024, 8192)  # samples of one pixel, to see a fault again
 
 
@@ -138,7 +138,7 @@ def _plugins(scene: mi.Scene) -> dict[str, list[mi.Object]]:
     return kinds
 
 
-# ------------------------------------------------- The hunt -----------------------------------------------
+# ------------------------------------- The search for bad pixels -------------------------------------
 
 
 def _hunt(shot: Shot, quick: bool, seed: int) -> PixelFault | None:

@@ -21,12 +21,12 @@ from .probe import (
     unit,
 )
 
-OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
-FLAT = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
-MOST_HITS = 16  # along a line
-HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
-TYPICAL = 16  # roundings: twice the most that was measured of sound shapes
-FAR = 1e4  # sizes away
+SPAWN_OFFSET = 1500 * ROUNDING  # of the origin of a spawned ray from its surface, over 1 + max |p|
+GRAZING_COSINE = 0.05  # cosine below which a ray grazes: what it meets hangs on roundings
+MAX_CROSSINGS = 16  # along a line
+MAX_HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
+MAX_MEDIAN_ROUNDINGS = 16  # roundings: twice the most that was measured of sound shapes
+FAR_DISTANCE = 1e4  # sizes away
 UNSCALED = ("BSplineCurve", "LinearCurve", "Ellipsoids", "EllipsoidsMesh")  # to_world leaves their radii
 SMOOTHED = ("SDFGrid", "BSplineCurve", "LinearCurve", "Instance")
 
@@ -54,7 +54,7 @@ def trace(target: mi.Scene, o: Array, d: Array) -> Lanes:
     found = lanes(call, ("Point3f", ray.o), ("Vector3f", ray.d))
     hits = named("met t p n shading du dv uv part", found).having(**vars(ray))
     hits.cos = dot(hits.n, hits.d)
-    hits.steep = hits.met & (abs(hits.cos) > FLAT)
+    hits.steep = hits.met & (abs(hits.cos) > GRAZING_COSINE)
     hits.clear = hits.steep | ~hits.met
     return hits
 
@@ -67,7 +67,7 @@ def dot(a: Array, b: Array) -> Array:
 def walk(target: mi.Scene, hits: Lanes) -> Iterator[tuple[Array, Lanes]]:
     """Follow N lines on from their first hits; yield hit by hit which lines meet something, and what."""
     line = np.arange(len(hits.t))
-    for _ in range(MOST_HITS):
+    for _ in range(MAX_CROSSINGS):
         line = line[hits.met]
         hits = hits[hits.met]
         if not len(line):
@@ -203,7 +203,7 @@ class ShapeCase(Case):
         even = np.ones(len(clear), bool)
         last = np.full((len(clear), 3), np.inf)
         for line, hits in self.crossings:
-            clear[line] &= (abs(hits.cos) > 4 * FLAT) & ~near(hits.p, last[line])
+            clear[line] &= (abs(hits.cos) > 4 * GRAZING_COSINE) & ~near(hits.p, last[line])
             even[line] ^= True
             last[line] = hits.p
         return clear, even
@@ -211,7 +211,7 @@ class ShapeCase(Case):
 
 def offset(p: Array) -> Array:
     """How far off the surface ``spawn_ray`` starts from points [N, 3]."""
-    return OFFSET * (1 + abs(p).max(axis=1))
+    return SPAWN_OFFSET * (1 + abs(p).max(axis=1))
 
 
 def near(p: Array, q: Array) -> Array:

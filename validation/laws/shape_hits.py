@@ -37,12 +37,12 @@ from .probe import (
     unit,
 )
 from .shape_case import (
-    FAR,
-    FLAT,
-    HIT_ROUNDINGS,
+    FAR_DISTANCE,
+    GRAZING_COSINE,
+    MAX_HIT_ROUNDINGS,
+    MAX_MEDIAN_ROUNDINGS,
     RAY,
     SMOOTHED,
-    TYPICAL,
     UNSCALED,
     ShapeCase,
     dot,
@@ -85,7 +85,7 @@ def hits(law: Outcome, case: ShapeCase) -> None:
 
 
 def _answers(law: Outcome, case: ShapeCase, rays: str, seen: Lanes, reach: float) -> None:
-    """Hold the answers about rays of a length of ``reach`` distances to what they are known to meet."""
+    """Check answers about rays of ``reach`` times the distance against what they are known to meet."""
     maxt = (seen.t * reach).astype(np.float32)
 
     def call(origin: mi.Point3f, direction: mi.Vector3f, most: mi.Float) -> list[mi.Mask]:
@@ -124,14 +124,14 @@ def close(size, si, ray):
 @measures(
     on_ray=most(
         "hit point off the ray at its distance, in roundings of the largest number",
-        HIT_ROUNDINGS,
+        MAX_HIT_ROUNDINGS,
         "some dozen operations",
         RAY,
     ),
     near_by=Criterion(
         0.5,
         "hit point off a ray of a twentieth of the size, in roundings of the largest coordinate, median",
-        TYPICAL,
+        MAX_MEDIAN_ROUNDINGS,
         "a few operations",
         RAY,
     ),
@@ -139,7 +139,7 @@ def close(size, si, ray):
         0.5,
         "hit points from in front and from behind, across the surface, in roundings of the largest "
         "coordinate, median",
-        TYPICAL,
+        MAX_MEDIAN_ROUNDINGS,
         "a few operations",
         RAY,
     ),
@@ -157,7 +157,8 @@ def close(size, si, ray):
     ),
     noise=Criterion(
         0.9,
-        f"noise of the {{what}} over that of {noise.ALLOWANCE:g} roundings with a rounded ray, 9 in 10",
+        f"rounding noise of the {{what}} over that of {noise.ALLOWANCE:g} roundings and of a rounded ray, "
+        "90th percentile",
         noise.MAX_NOISE,
         "digits are lost inside that could be kept",
         RAY,
@@ -191,7 +192,7 @@ def _again(law: Outcome, case: ShapeCase) -> None:
     again = trace(case.target, leave(few, away), away)
     # another part may truly be that near, in a hollow edge
     alike = abs(dot(again.n, few.n)) > np.where(again.part == few.part, 0.9, 0.9999)
-    bad = again.met & near(few.p, again.p) & (abs(dot(few.n, away)) > FLAT)
+    bad = again.met & near(few.p, again.p) & (abs(dot(few.n, away)) > GRAZING_COSINE)
     law.check("again", bad, again, where=alike, count=count)
 
 
@@ -266,7 +267,7 @@ def inwards(size, si, ray):
     side=number_of("shading normals on the other side than the geometric one", 0, "one surface", RAY),
     shading=Criterion(
         0.9,
-        "shading normal against the geometric one, except on smoothed meshes, 9 in 10",
+        "shading normal against the geometric one, except on smoothed meshes, 90th percentile",
         2e-3,
         "the same, within some roundings",
         RAY,
@@ -284,10 +285,14 @@ def inwards(size, si, ray):
         RAY,
     ),
     slope=Criterion(
-        0.95, "slope of the surface against its normal, by differences, 95 in 100", 1e-2, PARTED, NEIGHBOUR
+        0.95,
+        "slope of the surface against its normal, by differences, 95th percentile",
+        1e-2,
+        PARTED,
+        NEIGHBOUR,
     ),
     step=Criterion(
-        0.95, "step along the surface less its partial derivatives, 95 in 100", 1e-2, PARTED, NEIGHBOUR
+        0.95, "step along the surface less its partial derivatives, 95th percentile", 1e-2, PARTED, NEIGHBOUR
     ),
 )
 def normals(law: Outcome, case: ShapeCase) -> None:
@@ -439,7 +444,7 @@ print("as it is:", shape.bbox(), "scaled by 2^{power}:", box)
     ),
     off=most(
         "distance (relative) or normal at 2^{power} of the size, off",
-        HIT_ROUNDINGS * ROUNDING,
+        MAX_HIT_ROUNDINGS * ROUNDING,
         "some dozen operations, on scaled numbers",
         SCALED,
     ),
@@ -485,7 +490,7 @@ def afar(size, si, ray):
 @measures(
     missed=share_of(
         "share of rays from afar that miss what is met from nearby, or meet it "
-        f"{HIT_ROUNDINGS} roundings off",
+        f"{MAX_HIT_ROUNDINGS} roundings off",
         1e-3,
         "the origin is rounded, and some dozen operations with it; next to edges, more hangs on them",
         TWICE,
@@ -494,23 +499,23 @@ def afar(size, si, ray):
 def far(law: Outcome, case: ShapeCase) -> None:
     """Rays from ten thousand sizes away meet what the same lines meet from nearby, to some roundings."""
     met = case.few(case.met, 2**12, 2**15)
-    distance = FAR * case.size
+    distance = FAR_DISTANCE * case.size
     goal = np.float64(met.p)
     d = met.d
     exactly = np.float64(d)
     there = trace(case.target, goal - distance * exactly, d)
-    here = trace(case.target, there.o + (FAR - 1.5) * case.size * exactly, d)
+    here = trace(case.target, there.o + (FAR_DISTANCE - 1.5) * case.size * exactly, d)
     cos = abs(here.cos)
     apart = norm(np.float64(there.p) - here.p, axis=1)
     error = apart * cos / (ROUNDING * distance)
-    judged = here.met & (cos > 4 * FLAT)
+    judged = here.met & (cos > 4 * GRAZING_COSINE)
     # a rounded origin moves the line: only what all lines around it meet counts
     judged &= norm(here.p - goal, axis=1) < 20 * ROUNDING * distance
     across = unit(np.cross(d, case.units(len(d))))
     for side in (across, -across, np.cross(d, across), np.cross(across, d)):
         aside = trace(case.target, here.o + 4 * ROUNDING * distance * side, d)
         judged &= aside.met & (dot(aside.n, here.n) > 0.9)
-    law.check("missed", ~there.met | (error > HIT_ROUNDINGS), there, where=judged, other=here.o)
+    law.check("missed", ~there.met | (error > MAX_HIT_ROUNDINGS), there, where=judged, other=here.o)
 
 
 def no_number_along_axis(size, si, ray):
@@ -612,7 +617,7 @@ def bbox(law: Outcome, case: ShapeCase) -> None:
     answer=share_of("share of rays answered otherwise in {other}", 2e-3, "outlines hang on roundings", RAY),
     distance=most(
         "distance in {other}, off by roundings of the largest number",
-        4 * HIT_ROUNDINGS,
+        4 * MAX_HIT_ROUNDINGS,
         "some dozen operations each, and another cosine with the surface",
         RAY,
     ),

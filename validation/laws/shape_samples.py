@@ -31,7 +31,7 @@ from .probe import (
 )
 from .shape_case import (
     CONE,
-    HIT_ROUNDINGS,
+    MAX_HIT_ROUNDINGS,
     RAY,
     ShapeCase,
     dot,
@@ -134,14 +134,14 @@ def too_short(size, ds, it, u):
     area=most("mean of 1 / density against surface_area(), relative", 1e-3, SAME, POSITIONS),
     off=Criterion(
         0.9,
-        "sampled positions off the surface, 9 in 10, in roundings of the largest coordinate",
-        2 * HIT_ROUNDINGS,
+        "sampled positions off the surface, 90th percentile, in roundings of the largest coordinate",
+        2 * MAX_HIT_ROUNDINGS,
         "a few roundings",
         RAY,
     ),
     normal=Criterion(
         0.9,
-        "normals of sampled positions against those of rays, 1 - cosine, 9 in 10",
+        "normals of sampled positions against those of rays, 1 - cosine, 90th percentile",
         1e-3,
         "one surface",
         RAY,
@@ -152,10 +152,10 @@ def too_short(size, ds, it, u):
         "lines that graze may cross twice within the offset of a spawned ray",
         POSITIONS,
     ),
-    spread=p_value("chance of such positions if they follow the area, along the worst axis", POSITIONS),
+    spread=p_value("p-value of sampled positions against the area, along the worst axis", POSITIONS),
     direction=Criterion(
         0.99,
-        "density of a direction against pdf_direction(), relative, 99 in 100",
+        "density of a direction against pdf_direction(), relative, 99th percentile",
         1e-2,
         "the same number; near outlines the cosine, and the density with it, hangs on roundings",
         RAY,
@@ -167,7 +167,7 @@ def too_short(size, ds, it, u):
         RAY,
     ),
     aim=p_value(
-        "chance of such directions, if they follow their density, from the worst of some places", POSITIONS
+        "p-value of sampled directions against their density, from the worst of some places", POSITIONS
     ),
     angle=most(
         "solid angle of what is visible, or its middle or width, by samples against uniform "
@@ -226,7 +226,7 @@ def _area(law: Outcome, case: ShapeCase, s: Lanes, area: float) -> None:
     beyond = max(abs(estimates.mean() - area) - SIGMAS * estimates.std() / np.sqrt(count), 0)
     room = 3e-3 + 20 * float(offset(s.p).max()) / case.size + twice
     law.check("crossings", beyond / area, limit=room)
-    if twice > ROOM:
+    if twice > GRAZING_ALLOWANCE:
         law.notes.append("parts of it coincide: where positions lie is not judged")
         return
     # crossings of a line come together
@@ -241,7 +241,7 @@ def _area(law: Outcome, case: ShapeCase, s: Lanes, area: float) -> None:
 
 
 AXES = 12  # aslant, along which positions are compared
-ROOM = 2e-3  # lines that graze are left room for
+GRAZING_ALLOWANCE = 2e-3  # lines that graze are left room for
 VIEWS = 3  # from which directions are compared
 
 
@@ -270,7 +270,7 @@ def _chance(apart: Sequence[float], size: float) -> float:
 
     N. H. Kuiper, Tests concerning random points on a circle, Indagationes Mathematicae 63, 1960.
     """
-    square = size * max(max(apart) - ROOM, 0) ** 2
+    square = size * max(max(apart) - GRAZING_ALLOWANCE, 0) ** 2
     if square < 0.5:  # the series is near 1, and converges slowly
         return 1.0
     terms = square * np.arange(1, 20) ** 2

@@ -16,13 +16,16 @@ from scipy import stats
 from .law import NO_LANES, Outcome, sidak
 from .probe import Array, Function, Lanes, finite_or_0, joined
 
-DEPTH = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
+MAX_LEVEL = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
 SIDE = 6
-POINTS = SIDE**2  # at which a cell is integrated
-HEMISPHERE = 4**DEPTH  # codes of each
-SMALL = 7  # level of cells of about a degree
-ATTEMPTS = 8  # at integrals that are certain enough
-_SPREAD = np.sum([(np.arange(2**DEPTH) >> k & 1) << 2 * k for k in range(DEPTH)], axis=0)  # bits with gaps
+POINTS_PER_CELL = SIDE**2  # at which a cell is integrated
+HEMISPHERE = 4**MAX_LEVEL  # codes of each
+SMALL_CELL_LEVEL = 7  # level of cells of about a degree
+MAX_REFINEMENTS = 8  # at integrals that are certain enough
+# bits with gaps
+_SPREAD = np.sum(
+    [(np.arange(2**MAX_LEVEL) >> k & 1) << 2 * k for k in range(MAX_LEVEL)], axis=0
+)  # bits with gaps
 
 
 def encode(wo: Array) -> Array:
@@ -35,7 +38,7 @@ def encode(wo: Array) -> Array:
 
 def _bits(u: Array) -> Array:
     """The bits of numbers in [0, 1), with gaps between them for those of another."""
-    place = np.clip(np.nan_to_num(u) * 2**DEPTH, 0, 2**DEPTH - 1)
+    place = np.clip(np.nan_to_num(u) * 2**MAX_LEVEL, 0, 2**MAX_LEVEL - 1)
     return _SPREAD[place.astype(np.int64)]
 
 
@@ -45,7 +48,7 @@ class Cells(Lanes):
     @staticmethod
     def uniform(level: int) -> Cells:
         """All cells of a level."""
-        start = np.arange(2 * 4**level) * 4 ** (DEPTH - level)
+        start = np.arange(2 * 4**level) * 4 ** (MAX_LEVEL - level)
         return Cells(start=start, level=np.full(len(start), level))
 
     @staticmethod
@@ -56,14 +59,14 @@ class Cells(Lanes):
         cells = Cells.uniform(coarsest)
         while len(cells.start):
             first, last = np.searchsorted(codes, [cells.start, cells.end])
-            full = (last - first > most) & (cells.level < DEPTH)
+            full = (last - first > most) & (cells.level < MAX_LEVEL)
             done.append(cells[~full])
             cells = cells[full].quartered()
         return in_order(done)
 
     @property
     def end(self) -> Array:
-        return self.start + 4 ** (DEPTH - self.level)
+        return self.start + 4 ** (MAX_LEVEL - self.level)
 
     @property
     def width(self) -> Array:
@@ -75,7 +78,7 @@ class Cells(Lanes):
         bits = self.start % HEMISPHERE
         r = np.searchsorted(_SPREAD, bits & _SPREAD[-1])
         turn = np.searchsorted(_SPREAD, bits >> 1 & _SPREAD[-1])
-        return r / 2**DEPTH, turn / 2**DEPTH
+        return r / 2**MAX_LEVEL, turn / 2**MAX_LEVEL
 
     @property
     def below(self) -> Array:
@@ -86,14 +89,14 @@ class Cells(Lanes):
         """Index of the cell in which each direction lies."""
         level = self.level[0]
         if len(self.start) == 2 * 4**level:  # all cells of one level, which are found without a search
-            return codes // 4 ** (DEPTH - level)
+            return codes // 4 ** (MAX_LEVEL - level)
         return np.searchsorted(self.start, codes, side="right") - 1
 
     def quartered(self) -> Cells:
         """Four cells for each, one after the other."""
         level = np.repeat(self.level + 1, 4)
         part = np.tile(np.arange(4), len(self.start))
-        return Cells(start=np.repeat(self.start, 4) + part * 4 ** (DEPTH - level), level=level)
+        return Cells(start=np.repeat(self.start, 4) + part * 4 ** (MAX_LEVEL - level), level=level)
 
     def at(self, i: Array, j: Array) -> tuple[Array, Array]:
         """Directions [C, P, 3] at places of each cell, from 0 to 1, and r there [C, P]."""
@@ -106,9 +109,9 @@ class Cells(Lanes):
         return np.stack([sin * np.cos(phi), sin * np.sin(phi), z], axis=-1).astype(np.float32), r
 
     def points(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Random directions in each cell, one in each part [C, POINTS, 3], and dω [C, POINTS]."""
-        i, j = np.divmod(np.arange(POINTS), SIDE)
-        shift = rng.random((2, len(self.start), POINTS))
+        """Random directions in each cell, one in each part [C, P, 3], and dω [C, P]."""
+        i, j = np.divmod(np.arange(POINTS_PER_CELL), SIDE)
+        shift = rng.random((2, len(self.start), POINTS_PER_CELL))
         wo, r = self.at((i + shift[0]) / SIDE, (j + shift[1]) / SIDE)
         return wo, 4 * np.pi * r * (self.width[:, None] / SIDE) ** 2
 
@@ -138,8 +141,8 @@ class Cells(Lanes):
     def integrals(self, function: Function, rng: np.random.Generator) -> tuple[Array, Array]:
         """Integrals of ``function(directions [N, 3]) -> [N, K]`` over cells, and their variances. [C, K]"""
         wo, omega = self.points(rng)
-        values = function(wo.reshape(-1, 3)).reshape(*omega.shape, -1) * omega[..., None] * POINTS
-        return values.mean(axis=1), values.var(axis=1) / (POINTS - 1)
+        values = function(wo.reshape(-1, 3)).reshape(*omega.shape, -1) * omega[..., None] * POINTS_PER_CELL
+        return values.mean(axis=1), values.var(axis=1) / (POINTS_PER_CELL - 1)
 
     def expected(self, density: Function, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """How many of ``count`` samples are expected in each cell, and the variance of that. [C], [C]"""
@@ -160,7 +163,7 @@ def summed(counts: Array, group: Array) -> Array:
 
 
 def hold_small(law: Outcome, cells: Cells, counts: Array, known: float, at: Lanes = NO_LANES) -> None:
-    """Hold ``small`` to the least chance of counts in cells, and ``slices`` to that of counts in their rows.
+    """Check ``small`` by the smallest p-value of counts in cells, and ``slices`` by that of their rows.
 
     ``counts`` [3, C]: samples seen, samples expected, and the variance of the latter. ``known``: the relative
     error to which densities are known.
@@ -168,13 +171,13 @@ def hold_small(law: Outcome, cells: Cells, counts: Array, known: float, at: Lane
     counts = np.where(np.isfinite(counts[1]), counts, 0)  # where they are not, the law ``finite`` says so
     chances = chances_of(counts, known)
     cell = cells.bounds(int(chances.argmin()))
-    law.check("small", least_of(chances, len(chances)), at, cell=cell)
+    law.check("small", p_value_of_least(chances, len(chances)), at, cell=cell)
     chances = np.concatenate([chances_of(summed(counts, row), known) for row in cells.rows()])
-    law.check("slices", least_of(chances, len(chances)), at)
+    law.check("slices", p_value_of_least(chances, len(chances)), at)
 
 
 def chances_of(counts: Array, known: float) -> Array:
-    """The chances of so many or so few samples by a Poisson distribution, of ``counts`` [3, C]. [C]"""
+    """The one-sided p-values of ``counts`` [3, C] by a Poisson distribution. [C]"""
     seen, expected, variance = counts
     room = 3 * np.sqrt(variance) + known * expected  # is not Poisson's
     many = stats.poisson.sf(seen - 1, expected + room)
@@ -182,8 +185,8 @@ def chances_of(counts: Array, known: float) -> Array:
     return np.minimum(many, np.where(expected > room, few, 1))
 
 
-def least_of(chances: Array, tests: int) -> float:
-    """The chance that the least of so many tests is as low as that of ``chances``, each of many or of few."""
+def p_value_of_least(chances: Array, tests: int) -> float:
+    """The p-value of the smallest of so many two-sided tests."""
     return sidak(chances.min(), 2 * tests)
 
 
@@ -216,7 +219,7 @@ def integrate(
     codes = codes[order]
     sums = np.cumsum(np.broadcast_to(weights, codes.shape)[order])
     below = np.concatenate([[0], sums]) / samples
-    for attempt in range(ATTEMPTS):
+    for attempt in range(MAX_REFINEMENTS):
         first, last = below[np.searchsorted(codes, [cells.start, cells.end])]
         by_samples = last - first
         mean, variance = cells.integrals(finite, rng)
@@ -225,7 +228,7 @@ def integrate(
         enough = 0.25 * abs(mean) / total / samples + 1 / samples**2
         bad = (variance / total**2 > enough).any(axis=1)
         bad |= (by_samples * samples > 1.5) & (mean[:, 0] < 0.2 * by_samples)
-        bad &= (cells.level < DEPTH) & (attempt < ATTEMPTS - 1)
+        bad &= (cells.level < MAX_LEVEL) & (attempt < MAX_REFINEMENTS - 1)
         done.append(cells.having(mean=mean, variance=variance)[~bad])
         if not bad.any():
             break
