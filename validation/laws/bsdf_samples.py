@@ -178,7 +178,7 @@ def _densities(case: BsdfCase, view: View) -> Callable[[], Any]:
     grids = np.zeros((2, 2, 2**PLOTTED, 2**PLOTTED))
     grids[0][place] = cells.counts(encode(view.samples.wo[view.density > 0]))
     grids[1][place] = expected
-    grids[(slice(None), *place)] /= count * cells.solid_angle
+    grids[:, place[0], place[1], place[2]] /= count * cells.solid_angle
     seen, expected = grids
     return partial(plots.density, seen, expected, float(np.degrees(np.arccos(view.at.wi[2]))))
 
