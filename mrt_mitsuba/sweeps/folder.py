@@ -27,7 +27,7 @@ def reserved(folder: str) -> Iterator[None]:
     except (BlockingIOError, PermissionError) as error:
         reason = "another sweep works there; wait for it, or choose another folder"
         if not os.path.exists(path):
-            reason = error.strerror
+            reason = error.strerror or str(error)
         raise OutputError(f"cannot write to the folder {folder}: {reason}") from None
     except OSError as error:
         raise OutputError(f"cannot write to the folder {folder}: {error.strerror or error}") from error
