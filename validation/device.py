@@ -48,7 +48,13 @@ def picture(name: str, variant: str, size: tuple[int, int]) -> np.ndarray:
     runtime.use(variant)
     if name == "cornell":
         return mrt.render(scene_dict(name, size), aamode="none", aa=1, spp=16).image
-    options = {"width": size[0], "height": size[1], "aa": AA, "aamode": "none", "focaldist": 0}
+    options: dict[str, Any] = {
+        "width": size[0],
+        "height": size[1],
+        "aa": AA,
+        "aamode": "none",
+        "focaldist": 0,
+    }
     return mrt.render(int(name), **options).image
 
 

@@ -256,7 +256,7 @@ class RenderSettings:
             mean = self.spp or 1
             if mean < MIN_SPP:
                 raise UsageError(
-                    f"aamode=noise: give the mean samples per pixel as spp, {MIN_SPP} or more, or a target"
+                    f"aamode=noise: give the mean of a pixel's samples as spp, {MIN_SPP} or more, or a target"
                 )
             return Goal(None, min(mean, self.maxspp or mean), self.maxseconds, metric, self.denoise)
         if stated is None or self.aamode is not None or self.spp is not None:
