@@ -32,7 +32,7 @@ STOCK_EXTENT = 100.0
 def scene_dict(
     scene: int | Scene, *, width: int = 800, height: int = 600, fresnel: str = "schlick", flavor: str = "mrt"
 ) -> Node:
-    """A scene as a plain Mitsuba dict; ``mi.load_dict`` takes it (after ``mrt.register()``).
+    """Return a scene as a plain Mitsuba dict; ``mi.load_dict`` takes it (after ``mrt.register()``).
 
     ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
     any Mitsuba program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's
@@ -179,7 +179,7 @@ def _stock(nodes: Node, scene: Scene) -> Node:
 
 
 def _stock_bsdf(node: Node) -> Node:
-    """``roughplastic``, or ``diffuse`` where nothing is reflected; no colour exceeds 1."""
+    """Return ``roughplastic``, or ``diffuse`` where nothing is reflected, with colours up to 1."""
     colors = {name: dict(node[name]) for name in ("diffuse_reflectance", "specular_reflectance")}
     for color in colors.values():
         if color["type"] == "rgb":
@@ -193,7 +193,7 @@ def _stock_bsdf(node: Node) -> Node:
 
 
 def _facing(center: ArrayLike, normal: ArrayLike, half_size: float) -> mi.ScalarTransform4f:
-    """The transform that takes Mitsuba's rectangle or disc, of half size one and facing +z, to a place."""
+    """Return the transform that places Mitsuba's rectangle or disc, which has half size 1 and faces +z."""
     import mitsuba as mi
 
     ahead = np.divide(normal, np.linalg.norm(normal))

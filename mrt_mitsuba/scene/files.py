@@ -12,10 +12,10 @@ from pathlib import Path
 from mrt_mitsuba.errors import SceneError, warn
 from mrt_mitsuba.options import StrPath
 
-DEEPEST = 256  # levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
-LONGEST_LINE = 2**18  # bytes, about 40,000 corners of a face
+MAX_DEPTH = 256  # maximum levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
+MAX_LINE_BYTES = 2**18  # bytes, about 40,000 corners of a face
 _CONTINUED = b"\\\n"  # at the end of a line that goes on in the next
-MISSING = "is missing or may not be read in"  # what messages say about a file that a scene names
+MISSING = "is missing or may not be read in"  # text of messages about missing files
 
 
 def require_file(path: StrPath) -> None:
@@ -39,7 +39,7 @@ def require_file(path: StrPath) -> None:
 
 
 def read_text(path: Path) -> bytes:
-    """The bytes of a text file with Unix line ends, one at the end too; ``SceneError`` if it is no text.
+    """Return the bytes of a text file, with Unix line ends; raise ``SceneError`` for a binary file.
 
     Lines that end in a backslash are joined with the next; empty ones after them keep line numbers right.
     """
@@ -55,14 +55,16 @@ def read_text(path: Path) -> bytes:
     if _CONTINUED in data:
         data = re.sub(rb"(?m)^(?:.*\\\n)+.*\n", joined, data)
     longest = max(io.BytesIO(data), key=len).removesuffix(b"\n")
-    if len(longest) > LONGEST_LINE:
+    if len(longest) > MAX_LINE_BYTES:
         number = data.count(b"\n", 0, data.find(longest)) + 1
-        raise SceneError(f"{path}:{number}: a line of {len(longest)} bytes; at most {LONGEST_LINE} are read")
+        raise SceneError(
+            f"{path}:{number}: a line of {len(longest)} bytes; at most {MAX_LINE_BYTES} are read"
+        )
     return data
 
 
 def decode(data: bytes) -> str:
-    """Text of unknown encoding: UTF-8, or else the Latin-1 that older exporters wrote."""
+    """Decode text of unknown encoding: UTF-8, or else Latin-1, as older exporters wrote."""
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -77,7 +79,7 @@ def find(name: str, folders: list[Path]) -> Path | None:
     forms = dict.fromkeys([name, name.replace("\\ ", " "), name.replace("\\", "/"), name.strip('"')])
     places = (os.path.join(folder, form) for form in forms for folder in folders)
     found = next((place for place in places if os.path.isfile(place) and os.access(place, os.R_OK)), None)
-    return found and Path(found)
+    return Path(found) if found else None
 
 
 def has_alpha(path: StrPath) -> bool:
@@ -94,7 +96,7 @@ def has_alpha(path: StrPath) -> bool:
 
 
 def warn_of(findings: Mapping[str, list[str]]) -> None:
-    """Warn of findings, by kind in the plural: of the first, with the number of the others."""
+    """Warn of the first finding of each kind, a plural noun, with the number of the others."""
     for kind, texts in findings.items():
         more = f"; {len(texts) - 1} more {kind} likewise" if texts[1:] else ""
         if texts:
@@ -102,7 +104,7 @@ def warn_of(findings: Mapping[str, list[str]]) -> None:
 
 
 def elements(file: str) -> list[tuple[str, dict[str, str]]]:
-    """Tag and attributes of each element of an XML file, in order."""
+    """Return tag and attributes of each element of an XML file, in order."""
     from xml.parsers import expat
 
     require_file(file)
@@ -112,8 +114,8 @@ def elements(file: str) -> list[tuple[str, dict[str, str]]]:
     def start(tag: str, attributes: dict[str, str]) -> None:
         around.append(tag)
         read.append((tag, attributes))
-        if len(around) > DEEPEST:
-            raise SceneError(f"cannot load {file}: it is nested more than {DEEPEST} levels deep")
+        if len(around) > MAX_DEPTH:
+            raise SceneError(f"cannot load {file}: it is nested more than {MAX_DEPTH} levels deep")
 
     def end(tag: str) -> None:
         around.pop()

@@ -7,7 +7,7 @@ serve for data. Files that are read without an end (pipes, devices) and elements
 parser would end the process are refused as well.
 
 Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
-limit of the stack, and Dr.Jit's messages may wait for each other for ever; one by one takes no longer.
+limit of the stack, and Dr.Jit's messages may deadlock; loading them one by one takes no longer.
 ``mrt_mitsuba.mitsuba_changes`` makes that the default of Mitsuba's own loaders for our plugins.
 """
 
@@ -29,12 +29,12 @@ from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home
 from mrt_mitsuba.options import Values
-from mrt_mitsuba.scene.files import DEEPEST, elements, require_file
+from mrt_mitsuba.scene.files import MAX_DEPTH, elements, require_file
 
-DEEPEST_INCLUDE = 15  # files that include each other; Mitsuba refuses more
-MOST_INCLUDES = 1000
-LONGEST_SUBSTITUTION = 2**24  # characters that parameters of a file come to in all
-MOST_SAMPLES = 2**24  # of a pixel; some samplers divide by none, or never end at 2^31
+MAX_INCLUDE_DEPTH = 15  # files that include each other; Mitsuba refuses more
+MAX_INCLUDES = 1000
+MAX_SUBSTITUTED = 2**24  # maximum characters that all substitutions of a file add up to
+MAX_SAMPLE_COUNT = 2**24  # maximum spp; some samplers divide by zero at 0, or never end at 2^31
 
 # A traceback, all indented except its first line, with the type of this project's error; and the place in
 # Mitsuba's own sources where an error was raised
@@ -75,7 +75,7 @@ def load_file(
     options: Values | None = None,
     as_text: bool = False,
 ) -> tuple[mi.Object | str, Mapping[str, str]]:
-    """The scene of an XML file, and its ``$parameters`` with the values given, or the defaults.
+    """Return the scene of an XML file, and the values of its ``$parameters``.
 
     ``params``: values by the names of parameters, and by keys such as ``ball.center``; ``options``: those of
     a render, whose values are used for parameters of the same names, and None for those not given.
@@ -102,7 +102,7 @@ def load_file(
         for node in state.nodes:
             if isinstance(node.props.get("filename", None), str):
                 node.props["filename"] = os.path.abspath(_resolved(node.props["filename"]))
-        if strange := _set_stated(state, keys):
+        if strange := _set_properties(state, keys):
             raise UsageError(f"{path} does not state {min(strange)}: write it into the file")
         return mi.parser.write_string(state), xml.values
 
@@ -111,24 +111,26 @@ def load_file(
 
 
 def _check_nodes(nodes: Iterable[mi.parser.SceneNode], budget: Budget) -> None:
-    """Look at all that Mitsuba would load for what it has parsed."""
+    """Check the plugins, sample counts and files of parsed nodes."""
     mitsuba_first()  # a <path> of the file puts its folder before
     for node in nodes:
         kind = node.props.plugin_name()
         filename = node.props.get("filename", None)
         _check_plugin(kind)
         samples = node.props.get("sample_count", 1)
-        if isinstance(samples, int) and not 1 <= samples <= MOST_SAMPLES:
-            raise RuntimeError(f"{kind}: sample_count is {samples}; give 1 to {MOST_SAMPLES}")
+        if isinstance(samples, int) and not 1 <= samples <= MAX_SAMPLE_COUNT:
+            raise RuntimeError(f"{kind}: sample_count is {samples}; give 1 to {MAX_SAMPLE_COUNT}")
         if isinstance(filename, str):
             _check_data(filename, budget.inputs)
 
 
 def _instantiate(state: mi.parser.ParserState, merge: bool, keys: Values) -> mi.Object:
-    """Make the objects, with values set by keys: of what the scene states (``ball.center``), or else of
-    ``mi.traverse`` (``ball.to_world``)."""
-    unset = _set_stated(state, keys)
-    stated = [key for node, place in _named(state) for key in _stated_keys(node, place)] if unset else []
+    """Instantiate the objects, after setting properties that the scene gives (``ball.center``); set other
+    keys by ``mi.traverse`` (``ball.to_world``)."""
+    unset = _set_properties(state, keys)
+    stated = (
+        [key for node, place in _named_nodes(state) for key in _property_keys(node, place)] if unset else []
+    )
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False
     config.merge_meshes = merge
@@ -139,9 +141,9 @@ def _instantiate(state: mi.parser.ParserState, merge: bool, keys: Values) -> mi.
     return loaded
 
 
-# Types of values that a scene states, as ``mi.traverse`` calls them. The first variant of a process decides
-# whether their names begin with "Scalar"
-_STATED = {
+# Types of properties that can be set, with their names in ``mi.traverse``; the first variant of a process
+# decides whether their own names begin with "Scalar"
+_TYPE_NAMES = {
     "bool": "bool",
     "int": "int",
     "float": "Float",
@@ -152,8 +154,8 @@ _STATED = {
 }
 
 
-def _named(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, str]]:
-    """Yield the objects of a scene that have a name: by their place in a dict, or by their id in XML."""
+def _named_nodes(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, str]]:
+    """Yield the nodes that have a name: their path in a dict, or their id in XML."""
     places = state.node_paths
     for number, node in enumerate(state.nodes):
         place = places[number] if places else node.props.id()
@@ -161,32 +163,32 @@ def _named(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, 
             yield node, place
 
 
-def _stated_keys(node: mi.parser.SceneNode, place: str) -> list[str]:
-    return [f"{place}.{name}" for name in node.props if _kind(node.props[name]) in _STATED]
+def _property_keys(node: mi.parser.SceneNode, place: str) -> list[str]:
+    return [f"{place}.{name}" for name in node.props if _kind(node.props[name]) in _TYPE_NAMES]
 
 
 def _kind(value: object) -> str:
     return type(value).__name__.removeprefix("Scalar")
 
 
-def _set_stated(state: mi.parser.ParserState, keys: Values) -> Values:
-    """Change what a scene states before its objects are made; return the values of other keys."""
+def _set_properties(state: mi.parser.ParserState, keys: Values) -> Values:
+    """Set properties of parsed nodes; return the values of other keys."""
     unset = dict(keys)
     owners = {key.rpartition(".")[0] for key in keys}
-    for node, place in _named(state):
+    for node, place in _named_nodes(state):
         if place not in owners:
             continue
-        for key in keys.keys() & {*_stated_keys(node, place)}:
+        for key in keys.keys() & {*_property_keys(node, place)}:
             name = key.rpartition(".")[2]
             before = node.props[name]
-            node.props[name] = _converted(key, unset.pop(key), type(before), _STATED[_kind(before)])
+            node.props[name] = _converted(key, unset.pop(key), type(before), _TYPE_NAMES[_kind(before)])
     return unset
 
 
 def set_parameters(loaded: mi.Object, values: Values, stated: Sequence[str] = ()) -> None:
     """Set values by their ``mi.traverse`` key; raise ``UsageError`` for unknown ones and wrong types.
 
-    ``stated``: further keys that a message may suggest.
+    ``stated``: keys of properties, which a message may suggest.
     """
     if not values:
         return
@@ -202,13 +204,13 @@ def set_parameters(loaded: mi.Object, values: Values, stated: Sequence[str] = ()
 
 
 def _converted(key: str, value: Any, kind: type, name: str) -> Any:
-    """A value as one of a type; ``UsageError`` if it is not."""
+    """Convert a value to a type; raise ``UsageError`` if it does not fit."""
     try:
         if kind in (str, bool, int) and not isinstance(value, kind):
             raise TypeError
         if "AffineTransform" in name and hasattr(value, "matrix"):
             value = value.matrix
-        if kind.__name__.removeprefix("Scalar") in _STATED and hasattr(value, "__array__"):
+        if kind.__name__.removeprefix("Scalar") in _TYPE_NAMES and hasattr(value, "__array__"):
             value = np.array(value).squeeze()
         return kind(value)
     except (TypeError, ValueError, RuntimeError):
@@ -259,9 +261,9 @@ def _check_data(filename: str, inputs: set[str]) -> str:
 
 
 def _check_dict(node: Values, inputs: set[str], place: str = "", depth: int = 1) -> None:
-    """Look at every entry. None, cycles and depth would end the process."""
-    if depth > DEEPEST:
-        raise RuntimeError(f"it is nested more than {DEEPEST} levels deep")
+    """Check every entry: None, cycles and depth would end the process."""
+    if depth > MAX_DEPTH:
+        raise RuntimeError(f"it is nested more than {MAX_DEPTH} levels deep")
     for key, value in node.items():
         if isinstance(value, dict):
             _check_dict(value, inputs, f"{place}{key}.", depth + 1)
@@ -279,8 +281,8 @@ def _check_dict(node: Values, inputs: set[str], place: str = "", depth: int = 1)
 class XmlParameters:
     """The ``$parameters`` of an XML file, read with what it includes before Mitsuba opens any of them.
 
-    Parameters are substituted in the order of Mitsuba's parser, so that the names of included files are known
-    and what they come to is bounded.
+    Parameters are substituted in the order of Mitsuba's parser: this gives the names of included files, and
+    bounds the length of the text.
     """
 
     given: Mapping[str, str]
@@ -296,7 +298,7 @@ class XmlParameters:
         self.values |= self.given
 
     def read(self, path: str, depth: int = 0) -> None:
-        """Read a file and, at their places, those that it includes. Raises ``RuntimeError``."""
+        """Read a file and, in order, those that it includes. Raises ``RuntimeError``."""
         self.inputs.add(path)
         for tag, raw in elements(path):
             attributes = {key: self._substituted(text) if "$" in text else text for key, text in raw.items()}
@@ -310,20 +312,20 @@ class XmlParameters:
                 mitsuba_first(_resolved(attributes.get("value", "")))
             elif tag != "default" and attributes.get("filename"):
                 file = _check_data(attributes["filename"], self.inputs)
-                if tag == "include" and os.path.isfile(file) and depth < DEEPEST_INCLUDE:
+                if tag == "include" and os.path.isfile(file) and depth < MAX_INCLUDE_DEPTH:
                     self._include(file, depth + 1)
 
     def _include(self, file: str, depth: int) -> None:
         self.includes += 1
-        if self.includes > MOST_INCLUDES:
-            raise RuntimeError(f"it includes more than {MOST_INCLUDES} files")
+        if self.includes > MAX_INCLUDES:
+            raise RuntimeError(f"it includes more than {MAX_INCLUDES} files")
         outside = mi.file_resolver()
         mitsuba_first(os.path.dirname(file))  # an included file's own includes are relative to it
         self.read(file, depth)
         mi.set_file_resolver(outside)
 
     def _substituted(self, text: str) -> str:
-        """An attribute with its parameters filled in."""
+        """Return the text of an attribute with its parameters substituted."""
         for name in re.findall(r"\$(\w+)", text):
             if name not in self.values and self.options.get(name) is not None:
                 self.values[name] = str(self.options[name])
@@ -332,8 +334,8 @@ class XmlParameters:
             if pieces[1:]:
                 self.used.add(name)
                 self.length += len(pieces) * len(self.values[name])
-                if self.length > LONGEST_SUBSTITUTION:
-                    raise RuntimeError(f"its parameters come to more than {LONGEST_SUBSTITUTION} characters")
+                if self.length > MAX_SUBSTITUTED:
+                    raise RuntimeError(f"its parameters come to more than {MAX_SUBSTITUTED} characters")
                 text = self.values[name].join(pieces)
         return text
 

@@ -27,13 +27,13 @@ Node = dict[str, Any]  # an object as ``mi.load_dict`` takes it
 # The sky of most scenes of the report
 BLUE_SKY: Color = (0.2, 0.2, 0.7)
 
-SIZE = (800, 600)  # of the picture, in pixels, where the scene brings no film
-SIDE = integer(1, 65536)  # of a picture, in pixels; whether the memory suffices is checked later
+SIZE = (800, 600)  # default image size in pixels, for scenes without a film
+SIDE = integer(1, 65536)  # image side in pixels; whether the memory suffices is checked later
 FRESNEL = choice("schlick", "dielectric")
 CONVENTION = choice("report", "standard")  # of MTL files, and of how textures are looked up
-LARGEST = 3.4e38  # number that Mitsuba's float32 can hold
+MAX_FLOAT = 3.4e38  # largest float32
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
-# What is of use only with an OBJ file
+# Options that apply to OBJ files only
 MODEL_OPTIONS = ("convention", "texturing", "camera", "target", "up", "fov", "light")
 
 
@@ -47,7 +47,7 @@ class Camera:
     hfov: float = 60.0
 
     def problem(self) -> str:
-        """The reason that it sees nothing; an empty text if it sees."""
+        """Return why the camera is invalid; an empty text if it is valid."""
         import numpy as np
 
         for name in ("position", "target", "up"):
@@ -155,7 +155,7 @@ class Scene:
     files: frozenset[str] = field(default=frozenset(), compare=False)  #: that it was read from
 
     def to_dict(self, *, width: int = 800, height: int = 600, fresnel: str = "schlick") -> Node:
-        """The scene as a Mitsuba dict of this project's plugins, with materials shared by reference.
+        """Return the scene as a Mitsuba dict of this project's plugins, with materials shared by reference.
 
         Raises ``SceneError`` for a camera, a sky or an object of numbers that make no sense.
         """
@@ -169,7 +169,7 @@ class Scene:
         for kind, plugin in PLUGINS.items():
             single = getattr(self, f"{kind}s")
             grouped = []
-            if len(single) > MOST_SINGLE.get(kind, math.inf):
+            if len(single) > MAX_SINGLE.get(kind, math.inf):
                 grouped = [thing for thing in single if thing.material.texture is None]
                 single = [thing for thing in single if thing.material.texture is not None]
             for i, thing in enumerate(single):
@@ -197,21 +197,21 @@ class Scene:
 
 # The plugins of objects; all fields except the material, which comes last, are their parameters
 PLUGINS = {"sphere": "sphere", "cone": "mrt_cone", "cylinder": "mrt_cylinder", "plane": "mrt_plane"}
-# More objects of a kind than this make one shape: Mitsuba takes 0.1 ms to load a native shape and over 1 ms
-# for one in Python, each inside the one before, up to Python's limit of recursion
-MOST_SINGLE = {"sphere": 1000, "cone": 100, "cylinder": 100}
+# Maximum number of single shapes of a kind; more make one shape: Mitsuba takes 0.1 ms to load a native shape
+# and over 1 ms for one in Python, each inside the one before, up to Python's limit of recursion
+MAX_SINGLE = {"sphere": 1000, "cone": 100, "cylinder": 100}
 
 
 def _all_finite(values: Sequence[float], count: int) -> bool:
-    """Whether these are so many numbers, within the range of a float32."""
+    """True if these are ``count`` numbers within the range of a float32."""
     try:
-        return len(values) == count and all(abs(value) <= LARGEST for value in values)
+        return len(values) == count and all(abs(value) <= MAX_FLOAT for value in values)
     except TypeError:
         return False
 
 
 def _check(scene: Scene) -> None:
-    """Refuse what Mitsuba would draw as nothing, or as noise, without a word. Plugins check the rest."""
+    """Reject values for which Mitsuba silently renders nothing, or noise. Plugins check the rest."""
     problem = scene.camera.problem()
     if problem:
         raise SceneError(problem)
@@ -219,7 +219,7 @@ def _check(scene: Scene) -> None:
         raise SceneError(f"sky is {scene.sky!r}, but must be three finite numbers: red, green and blue")
     if scene.texturing not in ("report", "standard"):
         raise SceneError(f"texturing is {scene.texturing!r}, but must be report or standard")
-    for kind in MOST_SINGLE:
+    for kind in MAX_SINGLE:
         for i, thing in enumerate(getattr(scene, f"{kind}s")):
             *points, radius, _ = vars(thing).values()
             placed = all(_all_finite(point, 3) for point in points)
@@ -228,7 +228,7 @@ def _check(scene: Scene) -> None:
 
 
 def _sensor(camera: Camera, width: int, height: int) -> Node:
-    """The camera as a Mitsuba dict, with a film for a size in pixels."""
+    """Return the camera as a Mitsuba dict, with a film of a size in pixels."""
     import mitsuba as mi
 
     reach = math.dist(camera.position, camera.target)  # of scenes far smaller or larger than the report's
@@ -252,7 +252,7 @@ def _rgb(color: Color) -> Node:
 
 
 def _group(kind: str, objects: list, fresnel: str) -> tuple[Node, Node | None]:
-    """One shape of many objects, and a BSDF that looks up values by object if they differ, else None."""
+    """Return one shape of many objects, and a BSDF that looks up values by object; None if all are equal."""
     import mitsuba as mi
     import numpy as np
 
@@ -311,7 +311,7 @@ def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> Node:
 
 
 def _ranged(m: Material, texturing: str) -> mi.Bitmap:
-    """The picture of a texture with its base and gain, which apply to the values that are looked up."""
+    """Return the picture of a texture with its base and gain applied to the values that are looked up."""
     import mitsuba as mi
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""MTL files: what a material library of an OBJ file says, in the report's reading and in the standard one."""
+"""Reader of MTL files, the material libraries of OBJ files, by the report's or the standard convention."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 from mrt_mitsuba.errors import SceneError, warn
 from mrt_mitsuba.options import StrPath
 from mrt_mitsuba.scene.files import MISSING, decode, find, has_alpha, read_text, warn_of
-from mrt_mitsuba.scene.model import LARGEST, Material
+from mrt_mitsuba.scene.model import MAX_FLOAT, Material
 
-# What the statements mean, by convention: fields of ``Material``
+# Field of ``Material`` that a statement sets, by convention
 CONVENTIONS = {
     "report": {"Ka": "ior", "Ni": "alpha", "Ks": "specular", "Kd": "diffuse", "map_Kd": "texture"},
     "standard": {"Ni": "ior", "Ns": "alpha", "Ks": "specular", "Kd": "diffuse", "map_Kd": "texture"},
@@ -28,8 +28,8 @@ DEFAULT_MATERIAL = Material(
 _STANDARD = Material(ior=1.0, alpha=1.0, specular=(0.0, 0.0, 0.0), diffuse=(0.8, 0.8, 0.8))
 
 _KNOWN = ("Kd", "Ks", "Ka", "Ni", "Ns", "map_Kd")
-# What exporters write of statements and options that are not used, where it changes nothing; numbers without
-# their zeros
+# Unused statements and options that do not change the picture, as exporters write them; numbers without
+# trailing zeros
 _WITHOUT_EFFECT = {"d 1", "Tr 0", "illum 0", "illum 1", "illum 2", "sharpness 60", "Ke 0 0 0", "Tf 1 1 1"}
 _WITHOUT_EFFECT |= {"-blendu on", "-blendv on", "-clamp off", "-cc off", "-boost 0", "-bm 1", "-type sphere"}
 
@@ -99,7 +99,7 @@ def _without_comment(name: str) -> str:
 
 @dataclass
 class _Reader:
-    """The blocks of a file read so far."""
+    """State of reading a file."""
 
     path: Path
     convention: str
@@ -107,11 +107,11 @@ class _Reader:
     blocks: dict[str, dict[str, Any]] = field(default_factory=dict)  #: fields of ``Material``, by its name
     placements: dict[str, dict[str, Any]] = field(default_factory=dict)  #: of ``MtlMaterial``
     name: str = ""  #: of the block
-    unused: dict[str, str] = field(default_factory=dict)  #: where each statement or option is first, in words
-    missing: list[str] = field(default_factory=list)  #: textures, in words
+    unused: dict[str, str] = field(default_factory=dict)  #: first use of each statement or option
+    missing: list[str] = field(default_factory=list)  #: messages about textures
 
     def warn(self) -> None:
-        """Warn of what is missing and of what would change the picture and is not used."""
+        """Warn of missing textures, and of unused statements that would change the picture."""
         warn_of({"textures": self.missing})
         if self.unused:
             first, *others = self.unused
@@ -146,7 +146,7 @@ class _Reader:
             self.unused.setdefault(text.split()[0][:48], f"{where}: {text[:48].strip()}")
 
     def _texture(self, text: str, where: str) -> str | None:
-        """The path of a picture; None, with a finding, if it is missing. Options go into the block."""
+        """Return the path of a picture, and store its options; None if it is missing."""
         for line in dict.fromkeys((text, _without_comment(text), text.partition("#")[0].strip())):
             words = line.split()
             # options of some words before the name, which may have blanks in it
@@ -163,7 +163,7 @@ class _Reader:
         return None
 
     def _options(self, words: list[str], where: str) -> None:
-        """Take up the options of a texture."""
+        """Store the options of a texture, or record that they are unused."""
         for option in re.findall(r"-[a-zA-Z]\w*(?: [^-]\S*| -[\d.]\S*)*", " ".join(words)):
             name, *values = option.split()
             if name == "-s":
@@ -180,18 +180,18 @@ class _Reader:
 
 
 def _floats(option: str, words: list[str], where: str) -> list[float]:
-    """The one to three numbers of an option."""
+    """Return the one to three numbers of an option."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    if not 1 <= len(numbers) <= 3 or not all(abs(number) <= LARGEST for number in numbers):
+    if not 1 <= len(numbers) <= 3 or not all(abs(number) <= MAX_FLOAT for number in numbers):
         raise SceneError(f"{where}: {option[:80]!r} must have one to three finite numbers")
     return numbers
 
 
 def _numbers(statement: str, text: str, where: str) -> Any:
-    """The colour, index or roughness of a statement. Raises ``SceneError`` for anything else."""
+    """Return the colour, index or roughness of a statement. Raises ``SceneError`` for anything else."""
     counts = {1: "one number"}
     if statement[0] == "K":
         counts = {1: "one", 3: "three numbers"}
@@ -199,7 +199,7 @@ def _numbers(statement: str, text: str, where: str) -> Any:
         values = list(map(float, text.split()))
     except ValueError:
         values = []
-    if len(values) not in counts or not all(0 <= v <= LARGEST for v in values):
+    if len(values) not in counts or not all(0 <= v <= MAX_FLOAT for v in values):
         must = f"must be {' or '.join(counts.values())}, finite and not negative, but is"
         raise SceneError(f"{where}: {statement} {must} {text[:80]!r}")
     if statement == "Ns":

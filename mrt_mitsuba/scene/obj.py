@@ -33,10 +33,10 @@ _FORMS = {
     "vn": "vn must have 3 numbers",
     "f": "f must have 3 corners or more, all v, v/vt, v//vn or v/vt/vn",
 }
-# Names, groups, smoothing, curves and display: nothing that is rendered here
-_UNUSED = """g s o mg l p vp deg bmat step cstype curv curv2 surf parm trim hole scrv sp end con bevel
-    c_interp d_interp lod shadow_obj trace_obj ctech stech call csh maplib usemap"""
-_IGNORED = frozenset(_UNUSED.split())
+# Names, groups, smoothing, curves and display, which are not rendered
+_UNRENDERED_WORDS = """g s o mg l p vp deg bmat step cstype curv curv2 surf parm trim hole scrv sp end con
+    bevel c_interp d_interp lod shadow_obj trace_obj ctech stech call csh maplib usemap"""
+_UNRENDERED = frozenset(_UNRENDERED_WORDS.split())
 
 _GAP = rb"[ \t]{1,99}"
 _END = rb"[ \t]{0,99}\n"
@@ -52,7 +52,7 @@ _CORNERS = {
 
 
 def _run(name: str, word: bytes) -> bytes:
-    """The pattern of a run of lines with the same keyword and number of words.
+    """Return the pattern of a run of lines with the same keyword and number of words.
 
     "f_3_tn": up to 4096 lines of f and three words. "f_0_tn": a single line of f and seven words or more, as
     regular expressions keep a state for each repetition.
@@ -69,7 +69,7 @@ def _run(name: str, word: bytes) -> bytes:
 _VALUE_RUNS = "v_3 v_4 v_5 v_6 v_7 vt_1 vt_2 vt_3 vn_3"
 _RUNS = [_run(name, _REAL) for name in _VALUE_RUNS.split()]
 _RUNS += [_run(f"f_{n}_{form}", word) for n in (3, 4, 5, 6, 0) for form, (word, _) in _CORNERS.items()]
-# Lines that hold nothing used, and others: of those, one at a time
+# Runs of lines without data; any other line is matched alone
 _SKIPPED = rb"(?P<skipped>(?:[ \t]{0,99}(?:#[^\n]*|(?:g|s|o|l|p|mg)[ \t][^\n]*)?\n){1,4096})"
 _BLOCKS = re.compile(b"|".join([*_RUNS, _SKIPPED, rb"(?P<line>[^\n]*\n)"]))
 
@@ -78,8 +78,7 @@ _NUMBERS_ONLY = bytes(32 if chr(i) in "vtnf/\n" else i for i in range(256))
 
 
 def read_obj(path: StrPath, *, convention: str = "report") -> tuple[tuple[Mesh, ...], frozenset[str]]:
-    """The meshes of an OBJ file, one for each material that is used, and the paths of all files of the model,
-    used or not.
+    """Return the meshes of an OBJ file, one for each material that is used, and the paths of all its files.
 
     Faces are ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, with positive or negative indices. One with more than
     three corners is cut into triangles, also where it is not convex. Normals are used by the convention
@@ -101,7 +100,7 @@ def read_obj(path: StrPath, *, convention: str = "report") -> tuple[tuple[Mesh, 
 
 
 class _Reader:
-    """A file, as far as it has been read."""
+    """State of reading a file."""
 
     def __init__(self, path: Path, convention: str) -> None:
         self.path = path
@@ -123,7 +122,7 @@ class _Reader:
         raise SceneError(f"{self.path}:{line}: {text}")
 
     def note(self, kind: str, text: str) -> None:
-        """Note what a warning will tell; ``kind``: the plural of what it is about."""
+        """Record a finding for the warning after reading; ``kind``: a plural noun."""
         self.findings.setdefault(kind, []).append(f"{self.path}:{self.line}: {text}")
 
     def read(self, block: re.Match[bytes]) -> None:
@@ -176,7 +175,7 @@ class _Reader:
         elif keyword == "mtllib" and name not in self.statements:
             self.statements.add(name)
             self._libraries(name)
-        elif keyword and keyword not in _IGNORED and keyword != "mtllib":
+        elif keyword and keyword not in _UNRENDERED and keyword != "mtllib":
             self.note("statements", f"the statement {keyword[:40]!r} is unknown and is skipped")
 
     def _libraries(self, text: str) -> None:
@@ -198,7 +197,7 @@ class _Reader:
                 self.materials = read_mtl(library, convention=self.convention, folder=folder) | self.materials
 
     def meshes(self) -> tuple[Mesh, ...]:
-        """A mesh for each material, in the order of their first use."""
+        """Return a mesh for each material, in the order of first use."""
         found = {text: find_material(self.materials, text) for text in self.named}
         unknown = [
             f"{where}: no library has the material {text!r}; it gets the default"
@@ -237,15 +236,15 @@ class _Reader:
 
 
 def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, used: MtlMaterial, smooth: bool) -> Mesh:
-    """The mesh of triangles [T, 3, kinds of values], with the vertices that they use."""
+    """Return the mesh of triangles [T, 3, kinds of values], with the vertices that they use."""
     points, uvs, normals = values
     material = used.material
     v, vt, vn = np.moveaxis(triangles, -1, 0)
     if material.texture is None and not smooth:
-        used = np.zeros(len(points), bool)
-        used[v] = True
-        new = np.cumsum(used, dtype=np.uint32) - np.uint32(1)  # the vertices used, in their order
-        return Mesh(points[used], new[v], material)
+        kept = np.zeros(len(points), bool)
+        kept[v] = True
+        new = np.cumsum(kept, dtype=np.uint32) - np.uint32(1)  # the vertices used, in their order
+        return Mesh(points[kept], new[v], material)
     scale, offset = np.array([used.scale, used.offset], np.float32)
     # Each corner becomes a vertex: a point may have another texture or normal in another triangle
     faces = np.arange(v.size, dtype=np.uint32).reshape(-1, 3)
@@ -271,7 +270,7 @@ def obj_scene(
     sky: Color = BLUE_SKY,
     **view: Any,
 ) -> Scene:
-    """The scene of an OBJ file; camera and lights that are not given are placed by the model's size.
+    """Return the scene of an OBJ file; by default, camera and lights are placed by the model's size.
 
     The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
     on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. ``light``: where

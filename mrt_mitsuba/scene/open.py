@@ -1,4 +1,4 @@
-"""Opening what ``render`` is given as a scene."""
+"""Opening scenes of every kind that ``render`` takes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mrt_mitsuba.scene.loading import load_dict, load_file
 from mrt_mitsuba.scene.model import FOCAL_RANGE, MODEL_OPTIONS, SIZE, Scene
 from mrt_mitsuba.scene.report import report_scene
 
-WIDEST_FILTER = 1024  # pixels: the largest radius of a film's filter
+MAX_FILTER_RADIUS = 1024  # pixels
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Source:
     height: int
     focal_distance: float | None = None
     focal_range: float = FOCAL_RANGE
-    fresnel: str | None = None  #: the formula in force, where the scene leaves the choice
-    own: bool = False  #: is it someone's own, with a film and a sampler to honour
-    goal: Goal | None = None  #: how far rounds of rays go, where its integrator says so
+    fresnel: str | None = None  #: Fresnel formula of the report's scenes
+    own: bool = False  #: True for a user's scene, whose film and sampler count
+    goal: Goal | None = None  #: adaptive goal of its integrator, if it has one
 
 
 def open_scene(
@@ -107,7 +107,7 @@ def open_scene(
 
 
 def in_terms(scene: Any, model: Values) -> Scene | None:
-    """A number, a ``Scene`` or the path of an OBJ file in the report's terms; None for anything else.
+    """Return a number, a ``Scene`` or the path of an OBJ file as a ``Scene``; None for anything else.
 
     ``model``: options of ``obj_scene``. Raises ``UsageError`` where they are of no use.
     """
@@ -140,7 +140,7 @@ def sized(source: Source) -> Iterator[None]:
 def _loaded(
     scene: object, budget: Budget | None, params: Values, options: Values
 ) -> tuple[str, mi.Scene, Mapping[str, str]]:
-    """The name of someone's own scene, the Mitsuba scene, and the parameters of its file."""
+    """Return the name of a user's scene, the Mitsuba scene, and the parameters of its file."""
     if isinstance(scene, dict):
         return "a dict", load_dict(scene, budget=budget, keys=params), {}
     if isinstance(scene, str | os.PathLike):
@@ -165,7 +165,7 @@ def _check_variant(name: str, thing: object) -> None:
 
 
 def _number(values: Mapping[str, str], name: str, default: Any) -> Any:
-    """A number that an XML file declares, as ``write_xml`` writes it."""
+    """Return a number that an XML file declares, as ``write_xml`` writes it."""
     try:
         return max(0.0, float(values[name]))
     except (KeyError, ValueError):
@@ -184,7 +184,7 @@ def _sensor(name: str, scene: mi.Scene, number: int) -> mi.Sensor:
 
 
 def opened(name: str, scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator) -> Source:
-    """The source of someone's own loaded scene; ``SceneError`` if its sensor sees nothing."""
+    """Return the source of a loaded scene; raise ``SceneError`` if its sensor sees nothing."""
     parts = [sensor]
     if sensor.class_name() == "BatchSensor":
         parts = mi.traverse(sensor).hierarchy
@@ -196,8 +196,8 @@ def opened(name: str, scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integra
     radius = film.rfilter().radius()
     if width < 1 or height < 1:
         raise SceneError(f"{name} brings a film of {width}x{height}: give it one pixel at least")
-    if not 0 <= radius <= WIDEST_FILTER:
-        raise SceneError(f"{name} has a filter of radius {radius:g}: give at most {WIDEST_FILTER} pixels")
+    if not 0 <= radius <= MAX_FILTER_RADIUS:
+        raise SceneError(f"{name} has a filter of radius {radius:g}: give at most {MAX_FILTER_RADIUS} pixels")
     goal = None
     if isinstance(integrator, AdaptiveIntegrator):
         goal = integrator.goal

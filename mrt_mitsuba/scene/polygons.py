@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-MOST_CORNERS = 1000  # of a face that ears are cut from, in time that grows with their square
-FLAT = 1e-6  # of a polygon's area: how far a triangle may be turned over by rounding
-_PLANES = ((1, 2), (2, 0), (0, 1))  # coordinates of the plane across an axis
+MAX_EAR_CORNERS = 1000  # maximum corners for ear clipping, whose time is quadratic
+AREA_TOLERANCE = 1e-6  # fraction of a polygon's area: triangles turned over by less are rounding errors
+_PLANES = ((1, 2), (2, 0), (0, 1))  # coordinates to project to, by axis
 
 
 def triangulate(polygons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -27,10 +27,10 @@ def triangulate(polygons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     normals = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)  # of twice the area
 
     def turned(triangles: np.ndarray) -> np.ndarray:
-        """Which polygons have a triangle that is turned over."""
+        """True for polygons with a triangle that is turned over."""
         first, middle, last = (points[:, triangles[:, k]] for k in range(3))
         areas = np.einsum("fti,fi->ft", np.cross(middle - first, last - first), normals)
-        return (areas < -FLAT * (normals**2).sum(axis=1, keepdims=True)).any(axis=1)
+        return (areas < -AREA_TOLERANCE * (normals**2).sum(axis=1, keepdims=True)).any(axis=1)
 
     rest = np.flatnonzero(turned(fan))
     if not len(rest):
@@ -41,7 +41,7 @@ def triangulate(polygons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for row in rest[~suits]:
         axis = np.abs(normals[row]).argmax()
         plane = _PLANES[axis] if normals[row, axis] > 0 else _PLANES[axis][::-1]
-        ears = _ears(points[row][:, plane]) if count <= MOST_CORNERS else None
+        ears = _ears(points[row][:, plane]) if count <= MAX_EAR_CORNERS else None
         failed[row] = ears is None
         if ears is not None:
             cut[row] = ears

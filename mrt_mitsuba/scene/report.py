@@ -48,7 +48,7 @@ def _read(number: int) -> Scene:
 
 
 def _tuples(value: Any) -> Any:
-    """What JSON holds, with tuples in place of lists."""
+    """Return a value of JSON with tuples in place of lists."""
     if isinstance(value, dict):
         return {name: _tuples(each) for name, each in value.items()}
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
@@ -56,7 +56,7 @@ def _tuples(value: Any) -> Any:
 
 def _object(kind: str, materials: Mapping[str, Material], *row: Any) -> Any:
     """Make an object of a row: its numbers, the name of its material, and perhaps what of that differs."""
-    changes: dict[str, float] = {}
+    changes: dict[str, Any] = {}
     if isinstance(row[-1], dict):
         *row, changes = row  # type: ignore[assignment]
     *numbers, name = row

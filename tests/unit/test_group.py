@@ -44,7 +44,7 @@ def test_a_group_looks_like_its_members(monkeypatch, kind, materials):
     """Equal rays give equal pictures, but for roundings that move a silhouette or a shadow's edge."""
     content = crowd(kind, 40, materials)
     single = picture(content)
-    monkeypatch.setitem(scene.MOST_SINGLE, kind, 0)
+    monkeypatch.setitem(scene.MAX_SINGLE, kind, 0)
     nodes = content.to_dict()
     assert nodes[f"{kind}s"]["type"] == "mrt_group"
     assert f"{kind}_0" not in nodes
@@ -61,7 +61,7 @@ def test_textured_members_stay_single(monkeypatch, tmp_path):
     content = crowd("sphere", 3, 3)
     red = Material(1.5, 0.1, (0, 0, 0), (1, 1, 1), str(tmp_path / "red.png"))
     spheres = (*content.spheres, Sphere((0, 1, 0), 0.5, red))
-    monkeypatch.setitem(scene.MOST_SINGLE, "sphere", 2)
+    monkeypatch.setitem(scene.MAX_SINGLE, "sphere", 2)
     nodes = Scene(camera=content.camera, sky=(0, 0, 0), lights=content.lights, spheres=spheres).to_dict()
     assert nodes["sphere_0"]["center"] == [0, 1, 0]
     assert len(np.array(nodes["spheres"]["numbers"])) == 3
