@@ -8,9 +8,8 @@ from mrt_mitsuba.filters.edges import (
     edges_image,
     geometry_edges,
     luma_edges,
-    save_contours,
     sobel_edges,
 )
 
 __all__ = ["Denoised", "EdgeMap", "blur_amount", "contours", "denoise", "edges_image"]
-__all__ += ["gaussian_dof", "geometry_edges", "luma_edges", "save_contours", "sobel_edges"]
+__all__ += ["gaussian_dof", "geometry_edges", "luma_edges", "sobel_edges"]

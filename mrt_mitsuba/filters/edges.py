@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -234,13 +233,6 @@ def contours(*edges: EdgeMap) -> np.ndarray:
         parts += [gap, edges_image(each)]
     grey = np.concatenate(parts, axis=1)  # [H, W']
     return np.repeat(grey[..., None], 3, axis=-1)
-
-
-def save_contours(path: str | os.PathLike[str], *edges: EdgeMap) -> None:
-    """Write ``contours(*edges)`` as .png or .exr; raise ``OutputError`` where that fails."""
-    from mrt_mitsuba.files import save
-
-    save(path, contours(*edges))
 
 
 def _inner(grid: Grid) -> Mask:

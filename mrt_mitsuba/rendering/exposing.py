@@ -343,8 +343,9 @@ class Exposer:
         """
         width = self.film.width if self.film else self.shader.width
         most = self.job.workspace.wavefront_size(channels)
+        rays = min(most, WAVEFRONT)
         # the random numbers of Mitsuba's samplers depend on the cuts, which time must not decide
-        rays = most if self.film is not None and not self.film.independent else min(most, WAVEFRONT)
+        timed = self.film is None or self.film.independent
         start = time.perf_counter()
 
         def limit() -> int:
@@ -370,9 +371,9 @@ class Exposer:
             del place, values
             seconds = time.perf_counter() - start
             start += seconds
-            if seconds < QUICK:
+            if timed and seconds < QUICK:
                 rays = min(2 * rays, most)
-            elif seconds > SLOW:
+            elif timed and seconds > SLOW:
                 rays = max(rays // 2, min(rays, WAVEFRONT))
 
     def _one_by_one(self, groups: RayBatch, samples: Samples) -> tuple[np.ndarray, Values]:

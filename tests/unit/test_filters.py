@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from mrt_mitsuba import UsageError, filters, runtime
-from mrt_mitsuba.files.images import read_exr
+from mrt_mitsuba.files.images import read_exr, save
 from mrt_mitsuba.filters import (
     blur_amount,
     edges_image,
@@ -303,7 +303,7 @@ def test_contours_stand_side_by_side_in_white_on_black(tmp_path):
         for channel in (edges_image(edges), *np.moveaxis(part, -1, 0)):
             assert_array_equal(channel, edges.mask)
     for ending in ("png", "exr"):
-        filters.save_contours(tmp_path / f"contours.{ending}", luma, sobel)
+        save(tmp_path / f"contours.{ending}", sheet)
     assert_array_equal(read_exr(tmp_path / "contours.exr").image, sheet)
     with Image.open(tmp_path / "contours.png") as png:
         assert np.unique(np.asarray(png)).tolist() == [0, 127, 255]
