@@ -398,3 +398,8 @@ def test_each_figure_of_an_emitter_has_a_specimen():
         "sampling.light",
     }  # of ``MISTAKES``
     assert known == {f"{n}.{figure}" for n, law in emitters.LAWS.items() for figure in law.criteria}
+
+
+def test_a_scene_without_shapes_is_checked():
+    nodes = {"type": "scene", "sensor": {"type": "perspective"}, "sky": {"type": "constant"}}
+    assert mrt.check_scene(nodes | {"integrator": {"type": "path"}}, quick=True).passed

@@ -100,7 +100,8 @@ class EmitterCase(Case):
             kind = type(self.plugin).__name__
             raise UsageError(f"{kind} is not an emitter of {mi.variant()}: give a dict or a loaded emitter")
         self.lit = scene or self._lit_sphere()  # an emitter keeps neither its scene nor its shape alive
-        low, high = np.nan_to_num(probe.corners(self.lit), posinf=1, neginf=-1)
+        # of a scene without shapes, the box is empty
+        low, high = np.sort(np.nan_to_num(probe.corners(self.lit), posinf=1, neginf=-1), axis=0)
         size = float(norm(high - low))
         outer = 0.1 * size  # also across a flat box
         self.points = np.float32(self.rng.uniform(low - outer, high + outer, (2**12, 3)))
