@@ -32,7 +32,9 @@ def report_scene(number: int) -> Scene:
 def _read(number: int) -> Scene:
     table = _tuples(json.loads((_ASSETS / "scenes.json").read_text(encoding="utf-8")))["scenes"][number]
     materials = {name: Material(*values) for name, values in table["materials"].items()}
-    objects = {kind: tuple(_object(kind, materials, *row) for row in table.get(kind, ())) for kind in _KINDS}
+    objects: dict[str, Any] = {
+        kind: tuple(_object(kind, materials, *row) for row in table.get(kind, ())) for kind in _KINDS
+    }
     if "random_spheres" in table:
         objects["spheres"] = tuple(_random_spheres(table["random_spheres"], [*materials.values()]))
     fields = {
