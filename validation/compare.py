@@ -207,9 +207,12 @@ def _layer_of(channels: Mapping[str, Array], headers: Mapping[str, Any], layer: 
     if not keys:
         raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(sorted(groups))}")
     window = tuple(int(n) for corner in (headers[keys[0]]["dataWindow"] if headers else ()) for n in corner)
-    wanted = [keys] if layer or "error" not in groups else [keys, groups["error"]]
-    found, *error = (np.stack([channels[c] for c in names], -1, dtype=np.float64) for names in wanted)
-    return found, error[0] ** 2 if error else None, window
+    noise = "variance" if "variance" in groups else "error"  # which may be in another metric
+    wanted = [keys] if layer or noise not in groups else [keys, groups[noise]]
+    found, *known = (np.stack([channels[c] for c in names], -1, dtype=np.float64) for names in wanted)
+    if not known:
+        return found, None, window
+    return found, known[0] if noise == "variance" else known[0] ** 2, window
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:

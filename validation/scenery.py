@@ -74,10 +74,6 @@ def ball_scene(bsdf: Node, *, size: int) -> mi.Scene:
 # ----------------------------------------------- Whole scenes -----------------------------------------------
 
 
-# With most of the noise in one part of the picture
-LOCAL = ("thin_lens", "gloss", "texture_and_sky", "rough_glass")
-
-
 def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> mi.Scene:
     """Return a scene by name, at a size; ``film`` and further nodes replace its own."""
     nodes = SCENES[name]()

@@ -17,7 +17,7 @@ import numpy as np
 from mrt_mitsuba.adaptive.estimate import (
     HALVES,
     PILOTS,
-    QUANTILE_PIXELS,
+    SUBSET_PIXELS,
     WINDOWS,
     Forecast,
     SampleStatistics,
@@ -236,7 +236,7 @@ def _factor(
     Pixels keep the rays they have. ``variance``: of a ray; None: nothing is allowed. It falls by a power of
     the rays that is greater than 1 by the ``gain``. Found without rounding, from a subset of the pixels.
     """
-    step = max(1, deviation.size // QUANTILE_PIXELS)
+    step = max(1, deviation.size // SUBSET_PIXELS)
     every = deviation.ravel()[::step]
     there = have.ravel()[::step].astype(np.float32)
     total = deviation.sum()

@@ -30,8 +30,7 @@ WINDOWS = (1, 2, 4, 8)  # radii of the windows that pixels borrow variance from,
 UNSEEN_PSEUDOCOUNT = 0.25  # noisy pixels that are assumed to be among the others, unseen
 PRIOR_WEIGHT = 2  # squared errors that an estimated variance counts as much as
 MIN_CALIBRATION_RATIO = 0.05  # of measured to estimated squared errors: rare ones may be missing
-FIT_PIXELS = 2**11  # pixels, about, to which the mixture is fitted
-QUANTILE_PIXELS = 2**12  # pixels, about, by which quantiles are found
+SUBSET_PIXELS = 2**12  # pixels, about, from which mixtures, quantiles and factors are found
 NOISE_FIELDS = 16  # pictures of noise that are blurred to estimate the variance after a blur
 LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB
 
@@ -44,8 +43,8 @@ class Forecast:
 
     rmse: float  #: of the picture as it is
     tail: float  #: Pareto shape of what their rays contribute
-    noisy_fraction: float  #: of the pixels, that make up the noise
     variance: np.ndarray  #: of a ray, [H, W], in units of the squared error
+    uncertainty: float  #: relative standard error of an RMSE that halves estimate
 
 
 @dataclass(frozen=True)
@@ -295,8 +294,14 @@ def forecast(stats: SampleStatistics) -> Forecast:
     """Return the error of the picture as the pilot buffers foresee it."""
     variance = ray_variance(stats, stats.sums(2), stats.sums(3)) * np.float32(stats.unit)
     left = stats.without_border(variance / stats.count[HALVES].sum(0))
-    noisy = effective_number(stats.sums(*PILOTS).variance) / stats.film.pixels
-    return Forecast(math.sqrt(float(left.mean())), contribution_tail(stats, PILOTS), noisy, variance)
+    # of pixels whose errors are as unequal as deviations
+    number = effective_number(np.sqrt(variance)) / stats.film.correlation
+    return Forecast(
+        rmse=math.sqrt(float(left.mean())),
+        tail=contribution_tail(stats, PILOTS),
+        variance=variance,
+        uncertainty=1 / math.sqrt(2 * max(number, 1)),
+    )
 
 
 def ray_variance(
@@ -389,7 +394,7 @@ def _mixture(parts: np.ndarray, measured: np.ndarray) -> np.ndarray:
     By W. Richardson's and L. Lucy's steps (1972, 1974), in which a value weighs the less the more is expected
     of it, since a variance is as uncertain as it is large.
     """
-    step = max(1, math.isqrt(measured.size // FIT_PIXELS))
+    step = max(1, math.isqrt(measured.size // SUBSET_PIXELS))
     tiny = 1e-6 * measured.mean() + 1e-30
     known = parts[:, ::step, ::step].reshape(len(parts), -1).astype(np.float64) + tiny
     values = measured[::step, ::step].ravel() + tiny
@@ -410,7 +415,7 @@ def _calibrated(variance: np.ndarray, squares: np.ndarray) -> np.ndarray:
     noisy = variance > 0
     if not noisy.any():
         return variance.copy()
-    step = max(1, variance.size // QUANTILE_PIXELS)
+    step = max(1, variance.size // SUBSET_PIXELS)
     edges = np.quantile(variance[noisy][::step], np.arange(1, 10) / 10)
     tenth = np.searchsorted(edges, variance)  # of each pixel, 0 to 9
     factors = np.array([calibration(variance[tenth == k], squares[tenth == k]) for k in range(10)])

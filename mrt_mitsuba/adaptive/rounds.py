@@ -13,12 +13,11 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.adaptive.allocate import HEAVY_TAIL_SHAPE, Allocator
+from mrt_mitsuba.adaptive.allocate import Allocator
 from mrt_mitsuba.adaptive.denoise import Denoiser, cautious_error
 from mrt_mitsuba.adaptive.error import ErrorEstimate, Round, RoundPicture
 from mrt_mitsuba.adaptive.estimate import (
     Blurred,
-    Forecast,
     SampleStatistics,
     estimate_error,
     forecast,
@@ -38,14 +37,11 @@ log = logging.getLogger(__name__)
 
 GROWTH = 4.25  # maximum growth of the ray count per round: the error is known better then
 MIN_GROWTH = 1.05  # minimum growth for which another round pays off
-MIN_RAYS = 2**18  # of a picture with a target: fewer do not show what is rare
-MIN_RAYS_WIDESPREAD = 2**17  # where noise is widespread
+MIN_RAYS = 2**17  # of a picture with a target: fewer do not show what is rare
 MIN_SPP = 256  # rays of a pixel that a target takes at least, in a picture so small that this is less
-MAX_TAIL_DOUBLINGS = 2  # of the ray count, while the tail is heavy
-WIDESPREAD_NOISE = 0.2  # fraction of noisy pixels from which noise is widespread
 MIN_RELATIVE_DEVIATION = 0.25  # fraction of the mean deviation that each pixel has, until there are MIN_RAYS
-INITIAL_FRACTION = 0.85  # of the predicted rays to trace before the prediction is trusted
-TARGET_MARGIN = 0.95  # fraction of the target aimed for: a forecast is as often too low as too high
+TARGET_MARGIN = 0.97  # fraction of the target aimed for: a forecast is as often too low as too high
+SAFETY = 1.5  # standard errors of the RMSE by which to aim lower, so that few pictures need a further round
 
 OnRound = Callable[[RoundPicture], object]
 Stage = Callable[[str, int, str], AbstractContextManager[Advance]]
@@ -66,7 +62,6 @@ class NextRound:
 
     allocation: np.ndarray  #: groups of rays, see ``allocate.py``
     final: bool  #: halves have decided for each other
-    doublings: int = 0  #: of the ray count, for a heavy tail
 
 
 class Tracer:
@@ -199,21 +194,21 @@ def plan_round(
         most = min(most, now.spp * goal.max_seconds / now.seconds)
     if most < MIN_GROWTH * now.spp:
         return None
-    aim = None if target is None else TARGET_MARGIN * max(target, 1e-100)
     if not before.final:
-        following = _plan_by_pilots(allocator, stats, goal.max_spp, most, aim, now.spp, before.doublings)
+        following = _plan_by_pilots(allocator, stats, goal.max_spp, most, target, now.spp)
         if following.allocation.any():
             return following
-    return None if aim is None else _top_up(allocator, stats, most, aim, now)
+    return None if target is None else _top_up(allocator, stats, most, target, now)
 
 
 def _top_up(
-    allocator: Allocator, stats: SampleStatistics, most: float, aim: float, now: Round
+    allocator: Allocator, stats: SampleStatistics, most: float, target: float, now: Round
 ) -> NextRound | None:
     """Return a round that lowers the picture's own error to its target; None if it is there."""
-    if now.rmse * TARGET_MARGIN <= aim:
+    if now.rmse <= target:
         return None
-    most = min(most, now.spp * max((now.rmse / aim) ** 2, 2 * MIN_GROWTH - 1))
+    growth = (now.rmse / (TARGET_MARGIN * max(target, 1e-100))) ** 2
+    most = min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1))
     return NextRound(allocator.allocate_final(stats, most, None), final=True)
 
 
@@ -222,41 +217,33 @@ def _plan_by_pilots(
     stats: SampleStatistics,
     max_spp: float,
     most: float,
-    aim: float | None,
+    target: float | None,
     spp: float,
-    doublings: int,
 ) -> NextRound:
     """Return the next round after ``spp`` rays a pixel, at most ``most`` after it and ``max_spp`` in all.
 
-    ``aim``: the RMSE to reach; None: all rays are spent.
+    ``target``: the RMSE to reach; None: all rays are spent.
     """
-    if aim is None and most >= max_spp:
+    if target is None and most >= max_spp:
         return NextRound(allocator.allocate_final(stats, most, None), final=True)
     seen = forecast(stats)
     floor = 0.0
-    if aim is not None:
-        required = allocator.required_spp(stats, seen, aim)
-        minimum = min(_min_spp(stats, seen), max_spp)
+    if target is not None:
+        margin = max(TARGET_MARGIN - SAFETY * seen.uncertainty, 0.5)
+        aim: float | None = margin * max(target, 1e-100)
+        required = allocator.required_spp(stats, seen, margin * max(target, 1e-100))
+        minimum = min(MIN_SPP, MIN_RAYS / stats.film.pixels, max_spp)
         if spp < 0.9 * minimum:  # allocations are rounded
-            most = min(most, max(minimum, INITIAL_FRACTION * required))
+            most = min(most, minimum)
             floor = MIN_RELATIVE_DEVIATION
             aim = None
         elif required > most:  # cap at the fastest possible decay, spp^−(1 + gain)
             most = min(most, spp * (required / spp) ** (1 / (1 + allocator.gain)))
-        elif seen.tail > PARETO_K_THRESHOLD and doublings < MAX_TAIL_DOUBLINGS and required <= spp:
-            most = min(most, 2 * spp)
-            doublings += 1
         else:
             return NextRound(allocator.allocate_final(stats, most, aim), final=True)
         if most >= max_spp:
             return NextRound(allocator.allocate_final(stats, most, aim), final=True)
-    return NextRound(allocator.allocate(stats, seen, most, floor), final=False, doublings=doublings)
-
-
-def _min_spp(stats: SampleStatistics, seen: Forecast) -> float:
-    """Return the mean rays of a pixel that a target takes at least."""
-    widespread = seen.noisy_fraction > WIDESPREAD_NOISE and seen.tail < HEAVY_TAIL_SHAPE
-    return min(MIN_SPP, (MIN_RAYS_WIDESPREAD if widespread else MIN_RAYS) / stats.film.pixels)
+    return NextRound(allocator.allocate(stats, seen, most, floor), final=False)
 
 
 def _shown(
@@ -309,12 +296,12 @@ def _target_warning(goal: Goal, now: Round, target: float | None) -> str:
     if goal.target is None or target is None or now.rmse <= target:
         return ""
     asked = f"target={goal.target}, which is {target:.3g}," if goal.target.relative else f"target={target:g}"
-    metric = "" if goal.metric == LINEAR.name else f"{goal.metric} "
+    kind = "an error" if goal.metric == LINEAR.name else f"a {goal.metric} error"
     seconds = goal.max_seconds
     late = seconds is not None and seconds < MIN_GROWTH * now.seconds
     limit = f"maxseconds={seconds:g}" if late else f"maxspp={goal.max_spp}"
     return (
-        f"{asked} is not reached: {limit} ends the render at a {metric}error of {now.rmse:.3g}, after "
+        f"{asked} is not reached: {limit} ends the render at {kind} of {now.rmse:.3g}, after "
         f"{now.spp:.1f} rays a pixel and {now.seconds:.1f} s"
     )
 

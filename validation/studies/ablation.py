@@ -1,0 +1,115 @@
+"""Ablation of adaptive sampling: rays and error without each stage and constant, over kinds of noise."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import Any
+from unittest.mock import patch
+
+import mitsuba as mi
+import numpy as np
+from scipy.stats import gmean
+
+import mrt_mitsuba as mrt
+from mrt_mitsuba.adaptive import allocate, estimate, rounds
+from mrt_mitsuba.validation.compare import Array, averaged
+from mrt_mitsuba.validation.scenery import KINDS, load_kind
+from mrt_mitsuba.validation.study import Study, Values
+
+Change = tuple[Any, str, Any]  # an object, the name of an attribute, and a value in its place
+
+
+def _equal_weights(parts: Array, measured: Array) -> Array:
+    return np.full(len(parts), 1 / len(parts))
+
+
+def _by_pilots(allocator: Any, stats: Any, spp: float, rmse: float | None) -> Array:
+    seen = rounds.forecast(stats)
+    if rmse is not None:
+        spp = min(spp, allocator.required_spp(stats, seen, rmse))
+    return np.asarray(allocator.allocate(stats, seen, spp, 0.0))
+
+
+def _unsmoothed(variance: Array) -> Array:
+    return np.sqrt(variance + 1e-30)
+
+
+def _one_field(build: Callable[..., None]) -> Callable[..., None]:
+    def construct(allocator: Any, *arguments: Any) -> None:
+        build(allocator, *arguments)
+        allocator._fields = [np.ones(allocator.film.shape, bool)]
+
+    return construct
+
+
+ABLATIONS: dict[str, list[Change]] = {
+    "equal weights in the mixture": [(estimate, "_mixture", _equal_weights)],
+    "one window of 5 x 5": [(estimate, "WINDOWS", (2, 2, 2, 2))],
+    "no smoothing of deviations": [(allocate, "_smoothed", _unsmoothed)],
+    "pilots decide the last round": [(allocate.Allocator, "allocate_final", _by_pilots)],
+    "no chessboard": [(allocate.Allocator, "__init__", _one_field(allocate.Allocator.__init__))],
+    "no measured spread of errors": [(allocate, "_spread_like", lambda estimated, *_: estimated)],
+    "no measured gain": [(allocate.Allocator, "_measured_gain", lambda *_: 0.0)],
+    "no calibration of the last round": [(allocate, "calibration", lambda *_: 1.0)],
+    "PILOT_RATIO 1/15 for all": [(allocate, "PILOT_RATIO", (1 / 15, 1 / 15))],
+    "PILOT_RATIO 1/8 for all": [(allocate, "PILOT_RATIO", (1 / 8, 1 / 8))],
+    "GROWTH 8": [(rounds, "GROWTH", 8.0)],
+    "no MIN_RELATIVE_DEVIATION": [(rounds, "MIN_RELATIVE_DEVIATION", 0.0)],
+    "no MIN_RAYS": [(rounds, "MIN_RAYS", 0)],
+    "no SAFETY": [(rounds, "SAFETY", 0.0)],
+}
+
+
+TITLE = "What each stage of adaptive sampling brings"
+
+
+def run(study: Study, *, quick: bool) -> None:
+    """Render without each stage, one at a time."""
+    if quick:
+        ablate(study, size=48, rays=64, seeds=2, kinds=KINDS[:2])
+    else:
+        ablate(study, size=96, rays=256, seeds=8)
+
+
+def ablate(study: Study, *, size: int, rays: int, seeds: int, kinds: Sequence[str] = KINDS) -> None:
+    """State a table of rays and of errors without each stage, relative to the sampler as it is."""
+    scenes = {kind: load_kind(kind, size) for kind in kinds}
+    truths = {kind: truth(scene, rays) for kind, scene in scenes.items()}
+    base: dict[str, tuple[float, float]] = {}
+    rows: list[Values] = []
+    for name in study.each("Ablation", ["as it is", *ABLATIONS]):
+        row: Values = {"stage": name}
+        for kind, scene in scenes.items():
+            with ExitStack() as changes:
+                for change in ABLATIONS.get(name, []):
+                    changes.enter_context(patch.object(*change))
+                spent, square, off = measured(scene, *truths[kind], seeds)
+            base.setdefault(kind, (spent, square))
+            row[kind] = spent * square / (base[kind][0] * base[kind][1])
+            row[f"{kind}: error"] = off
+        row["mean"] = float(gmean([row[kind] for kind in scenes]))
+        rows.append(row)
+    note = (
+        "Rays times squared error, over those of the sampler as it is; error: median true error over target."
+    )
+    study.records("ablation", f"Ablation, {size}x{size}, the error of {rays} rays", rows, note)
+
+
+def truth(scene: Any, rays: int) -> tuple[Array, float, float]:
+    """A converged picture, the variance of its noise, and the error that so many uniform rays leave."""
+    pictures = [np.array(mi.render(scene, spp=4 * rays, seed=1000 + k)) for k in range(8)]
+    mean, noise = averaged(pictures)
+    left = np.mean([np.square(np.array(mi.render(scene, spp=rays, seed=k)) - mean).mean() for k in range(2)])
+    return mean, float(noise.mean()), float(np.sqrt(left))
+
+
+def measured(scene: Any, true: Array, noise: float, target: float, seeds: int) -> tuple[float, float, float]:
+    """Mean rays of a pixel, mean squared error, and the median of error over target."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mrt.MrtWarning)
+        results = [mrt.render(scene, target=target, seed=seed) for seed in range(seeds)]
+    squares = np.array([max(np.square(result.image - true).mean() - noise, 1e-12) for result in results])
+    spent = float(np.mean([result.rounds[-1].spp for result in results]))
+    return spent, float(squares.mean()), float(np.median(np.sqrt(squares))) / target
