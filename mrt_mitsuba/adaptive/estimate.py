@@ -26,7 +26,7 @@ from mrt_mitsuba.rendering.exposing import FilmAccumulator
 from mrt_mitsuba.rendering.film import Film
 
 HALVES, PILOTS = [0, 1], [2, 3]
-WINDOWS = (1, 2, 4, 8)  # radii of the windows that pixels borrow variance from, in pixels
+WINDOWS = (2, 8)  # radii of the windows that pixels borrow variance from, in pixels
 UNSEEN_PSEUDOCOUNT = 0.25  # noisy pixels that are assumed to be among the others, unseen
 PRIOR_WEIGHT = 2  # squared errors that an estimated variance counts as much as
 MIN_CALIBRATION_RATIO = 0.05  # of measured to estimated squared errors: rare ones may be missing
@@ -42,7 +42,6 @@ class Forecast:
     """Error forecast from the pilot buffers."""
 
     rmse: float  #: of the picture as it is
-    tail: float  #: Pareto shape of what their rays contribute
     variance: np.ndarray  #: of a ray, [H, W], in units of the squared error
     uncertainty: float  #: relative standard error of an RMSE that halves estimate
 
@@ -84,7 +83,6 @@ class SampleStatistics:
     pilots: FilmAccumulator | None  #: as a filter has them; None under a box
     invalid: np.ndarray  #: met a ray whose colour is NaN, or whose square overflows, [H, W]
     worst_invalid: float  #: the largest of such colours
-    previous_differences: np.ndarray | None  #: ``half_differences`` of the round before
 
     @classmethod
     def blank(cls, film: Film, channels: int, metric: Metric) -> SampleStatistics:
@@ -100,7 +98,6 @@ class SampleStatistics:
             pilots=FilmAccumulator.blank(film, 2, 3) if film.reach else None,
             invalid=np.zeros(film.shape, bool),
             worst_invalid=0.0,
-            previous_differences=None,
         )
 
     @property
@@ -147,11 +144,6 @@ class SampleStatistics:
     def sums(self, first: int, second: int | None = None) -> Sums:
         """Sums of one buffer, or of two combined."""
         return self._buffers[first] if second is None else self._buffers[first] + self._buffers[second]
-
-    @cached_property
-    def half_differences(self) -> np.ndarray:
-        """The ``differences`` of the half buffers."""
-        return differences(self.sums(0), self.sums(1))
 
     def samples(self) -> np.ndarray:
         """Rays of each pixel in all buffers, [H, W], without the border."""
@@ -253,7 +245,7 @@ def pixel_variance(stats: SampleStatistics, blurred: Blurred | None) -> np.ndarr
     each *= linear.unit * (1 / stats.count[HALVES]).sum(0) / 4
     squares = stats.squared_errors(LINEAR)
     total = _calibrated(stats.without_border(stats.film.filtered_variance(each)), squares.mean(-1))
-    near = _window_means(squares, WINDOWS[2]) + 1e-30
+    near = _window_means(squares, WINDOWS[-1]) + 1e-30
     variance = total[..., None] * near / near.mean(-1, keepdims=True)
     if blurred is not None:
         variance = _blurred_variance(variance, stats.squared_errors(LINEAR, blurred), blurred)
@@ -294,30 +286,24 @@ def forecast(stats: SampleStatistics) -> Forecast:
     """Return the error of the picture as the pilot buffers foresee it."""
     variance = ray_variance(stats, stats.sums(2), stats.sums(3)) * np.float32(stats.unit)
     left = stats.without_border(variance / stats.count[HALVES].sum(0))
-    # of pixels whose errors are as unequal as deviations
-    number = effective_number(np.sqrt(variance)) / stats.film.correlation
+    squares, _ = differences(stats.sums(2), stats.sums(3))
+    number = effective_number(squares) / stats.film.correlation
     return Forecast(
         rmse=math.sqrt(float(left.mean())),
-        tail=contribution_tail(stats, PILOTS),
         variance=variance,
-        uncertainty=1 / math.sqrt(2 * max(number, 1)),
+        uncertainty=0.5 / math.sqrt(max(number, 1)),
     )
 
 
 def ray_variance(
-    stats: SampleStatistics,
-    first: Sums,
-    second: Sums,
-    near: np.ndarray | None = None,
-    unseen: float = UNSEEN_PSEUDOCOUNT,
+    stats: SampleStatistics, first: Sums, second: Sums, unseen: float = UNSEEN_PSEUDOCOUNT
 ) -> np.ndarray:
-    """Return the variance of a pixel times its rays, [..., H, W], in the unit of the sums of two buffers.
+    """Return the variance of a pixel times its rays, [H, W], in the unit of the sums of two buffers.
 
     Pixels that met no rare bright ray look quiet, so each borrows from windows around it, and from the
     picture: in the mixture of the first buffer that explains best what the second measures. Rays of a
     sequence err less than independent ones: by that much, the buffers differ less than their rays do.
-    ``near``: means of ``differences`` of other buffers around each pixel, which show it better,
-    [..., 2, H, W]. ``unseen``: see ``UNSEEN_PSEUDOCOUNT``; errors that are stated count it twice.
+    ``unseen``: see ``UNSEEN_PSEUDOCOUNT``; errors that are stated count it twice.
     """
     film = stats.film
     seen = first.variance
@@ -331,9 +317,8 @@ def ray_variance(
     if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
         mixed[quiet & also] = 0
     mixed[..., stats.scale == 0] = 0
-    if near is None:
-        near = nearby(differences(first, second), WINDOWS[3:])
-    found, expected = np.moveaxis(near, -3, 0)
+    every = differences(first, second)
+    found, expected = window_means(every, WINDOWS[-1]) + 0.2 * every.mean((-2, -1), keepdims=True)
     ratio = film.between_pixel_share * found / np.maximum(expected, 1e-30) + _between_pixels(stats)
     return np.asarray(mixed * ratio * np.float32(film.filter_variance_ratio))
 
@@ -382,12 +367,6 @@ def effective_number(values: np.ndarray) -> float:
     return float(flat.sum(dtype=np.float64) ** 2 / max(float(flat @ flat), 1e-300))
 
 
-def nearby(values: np.ndarray, widths: Sequence[int]) -> np.ndarray:
-    """Return means of values [..., H, W] around each pixel, with a little of the mean of all."""
-    near = sum(window_means(values, width) for width in widths) / len(widths)
-    return np.asarray(near + 0.2 * values.mean((-2, -1), keepdims=True))
-
-
 def _mixture(parts: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Return weights, 0 or more, with which parts [parts, H, W] add up to what is nearest to values [H, W].
 
@@ -418,11 +397,11 @@ def _calibrated(variance: np.ndarray, squares: np.ndarray) -> np.ndarray:
     step = max(1, variance.size // SUBSET_PIXELS)
     edges = np.quantile(variance[noisy][::step], np.arange(1, 10) / 10)
     tenth = np.searchsorted(edges, variance)  # of each pixel, 0 to 9
-    factors = np.array([calibration(variance[tenth == k], squares[tenth == k]) for k in range(10)])
+    factors = np.array([_calibration(variance[tenth == k], squares[tenth == k]) for k in range(10)])
     return np.asarray(variance * factors[tenth])
 
 
-def calibration(estimated: np.ndarray, measured: np.ndarray) -> float:
+def _calibration(estimated: np.ndarray, measured: np.ndarray) -> float:
     """Return the factor that pulls estimated squared errors towards the measured sum.
 
     The more measured errors make up that sum, the farther.

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import mitsuba as mi
@@ -18,6 +18,7 @@ from mrt_mitsuba.adaptive.denoise import Denoiser, cautious_error
 from mrt_mitsuba.adaptive.error import ErrorEstimate, Round, RoundPicture
 from mrt_mitsuba.adaptive.estimate import (
     Blurred,
+    Forecast,
     SampleStatistics,
     estimate_error,
     forecast,
@@ -38,9 +39,11 @@ log = logging.getLogger(__name__)
 GROWTH = 4.25  # maximum growth of the ray count per round: the error is known better then
 MIN_GROWTH = 1.05  # minimum growth for which another round pays off
 MIN_RAYS = 2**17  # of a picture with a target: fewer do not show what is rare
-MIN_SPP = 256  # rays of a pixel that a target takes at least, in a picture so small that this is less
 MIN_RELATIVE_DEVIATION = 0.25  # fraction of the mean deviation that each pixel has, until there are MIN_RAYS
+MIN_SPP = 256  # rays of a pixel that a target takes at least, in a picture so small that this is less
 TARGET_MARGIN = 0.97  # fraction of the target aimed for: a forecast is as often too low as too high
+MIN_MARGIN = 0.7  # whatever the standard error of the RMSE
+TRUSTED_GROWTH = 1.2  # of the ray count, for which a forecast is right without the gain of a sequence
 SAFETY = 1.5  # standard errors of the RMSE by which to aim lower, so that few pictures need a further round
 
 OnRound = Callable[[RoundPicture], object]
@@ -54,14 +57,6 @@ class Finished(NamedTuple):
     stats: SampleStatistics
     error: ErrorEstimate
     denoised: Denoised | None  #: None where it was not asked for, or left out
-
-
-@dataclass(frozen=True)
-class NextRound:
-    """Allocation of a further round."""
-
-    allocation: np.ndarray  #: groups of rays, see ``allocate.py``
-    final: bool  #: halves have decided for each other
 
 
 class Tracer:
@@ -114,7 +109,6 @@ class Tracer:
             pilots=pilots,
             invalid=invalid,
             worst_invalid=worst,
-            previous_differences=stats.half_differences if stats.count.all() else None,
         )
 
 
@@ -140,12 +134,11 @@ def run_rounds(
     target: float | None = None
     stopped = False
     stats = tracer.blank(goal.metric)
-    following: NextRound | None = NextRound(tracer.initial_allocation, final=False)
-    while following:
-        cost = tracer.cost(following.allocation)
+    allocation: np.ndarray | None = tracer.initial_allocation
+    while allocation is not None and (cost := tracer.cost(allocation)):
         spent += cost
         with stage("rounds", cost, _message(done, target, cost / pixels)) as advance:
-            stats = tracer.trace(stats, following.allocation, advance)
+            stats = tracer.trace(stats, allocation, advance)
         if goal.target and target is None:
             target = goal.target.rmse(stats.metric.reference or stats.luminance())
         plain = math.sqrt(float(stats.squared_errors(stats.metric, blurred).mean(-1).mean()))
@@ -163,7 +156,7 @@ def run_rounds(
         if denoiser and target:
             wanted = denoiser.plain_target(now.spp, plain, target)
         now = replace(now, rmse=plain)
-        following = plan_round(tracer.allocator, stats, goal, wanted, now, following)
+        allocation = plan_round(tracer.allocator, stats, goal, wanted, now)
     if denoiser and denoised is None and not denoiser.left_out and target != 0:
         denoised = denoiser.mixture(stats, plain)
         done[-1] = replace(now, rmse=denoised.rmse, seconds=time.perf_counter() - start)
@@ -181,69 +174,37 @@ def run_rounds(
 
 
 def plan_round(
-    allocator: Allocator,
-    stats: SampleStatistics,
-    goal: Goal,
-    target: float | None,
-    now: Round,
-    before: NextRound,
-) -> NextRound | None:
-    """Return the next round after ``now``, or None if the goal is reached."""
+    allocator: Allocator, stats: SampleStatistics, goal: Goal, target: float | None, now: Round
+) -> np.ndarray | None:
+    """Return the allocation of a round after ``now``, or None if the goal is reached."""
     most = min(goal.max_spp, GROWTH * now.spp)
     if goal.max_seconds is not None:
         most = min(most, now.spp * goal.max_seconds / now.seconds)
     if most < MIN_GROWTH * now.spp:
         return None
-    if not before.final:
-        following = _plan_by_pilots(allocator, stats, goal.max_spp, most, target, now.spp)
-        if following.allocation.any():
-            return following
-    return None if target is None else _top_up(allocator, stats, most, target, now)
+    seen = forecast(stats)
+    if target is None:
+        return allocator.allocate(stats, seen, most)
+    minimum = min(MIN_SPP, MIN_RAYS / stats.film.pixels, goal.max_spp)
+    if now.spp < 0.9 * minimum:  # allocations are rounded
+        return allocator.allocate(stats, seen, min(most, minimum), MIN_RELATIVE_DEVIATION)
+    margin = max(TARGET_MARGIN - SAFETY * seen.uncertainty, MIN_MARGIN)
+    required = allocator.required_spp(stats, seen, margin * max(target, 1e-100))
+    if required < MIN_GROWTH * now.spp:
+        return _top_up(allocator, stats, seen, most, target, now)
+    if required > TRUSTED_GROWTH * now.spp:  # variance may fall as fast as spp^−(1 + gain)
+        required = now.spp * (required / now.spp) ** (1 / (1 + allocator.gain))
+    return allocator.allocate(stats, seen, min(most, required))
 
 
 def _top_up(
-    allocator: Allocator, stats: SampleStatistics, most: float, target: float, now: Round
-) -> NextRound | None:
-    """Return a round that lowers the picture's own error to its target; None if it is there."""
+    allocator: Allocator, stats: SampleStatistics, seen: Forecast, most: float, target: float, now: Round
+) -> np.ndarray | None:
+    """Return an allocation that lowers the picture's own error to its target; None if it is there."""
     if now.rmse <= target:
         return None
     growth = (now.rmse / (TARGET_MARGIN * max(target, 1e-100))) ** 2
-    most = min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1))
-    return NextRound(allocator.allocate_final(stats, most, None), final=True)
-
-
-def _plan_by_pilots(
-    allocator: Allocator,
-    stats: SampleStatistics,
-    max_spp: float,
-    most: float,
-    target: float | None,
-    spp: float,
-) -> NextRound:
-    """Return the next round after ``spp`` rays a pixel, at most ``most`` after it and ``max_spp`` in all.
-
-    ``target``: the RMSE to reach; None: all rays are spent.
-    """
-    if target is None and most >= max_spp:
-        return NextRound(allocator.allocate_final(stats, most, None), final=True)
-    seen = forecast(stats)
-    floor = 0.0
-    if target is not None:
-        margin = max(TARGET_MARGIN - SAFETY * seen.uncertainty, 0.5)
-        aim: float | None = margin * max(target, 1e-100)
-        required = allocator.required_spp(stats, seen, margin * max(target, 1e-100))
-        minimum = min(MIN_SPP, MIN_RAYS / stats.film.pixels, max_spp)
-        if spp < 0.9 * minimum:  # allocations are rounded
-            most = min(most, minimum)
-            floor = MIN_RELATIVE_DEVIATION
-            aim = None
-        elif required > most:  # cap at the fastest possible decay, spp^−(1 + gain)
-            most = min(most, spp * (required / spp) ** (1 / (1 + allocator.gain)))
-        else:
-            return NextRound(allocator.allocate_final(stats, most, aim), final=True)
-        if most >= max_spp:
-            return NextRound(allocator.allocate_final(stats, most, aim), final=True)
-    return NextRound(allocator.allocate(stats, seen, most, floor), final=False)
+    return allocator.allocate(stats, seen, min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1)))
 
 
 def _shown(

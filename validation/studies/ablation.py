@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 from unittest.mock import patch
@@ -25,39 +25,19 @@ def _equal_weights(parts: Array, measured: Array) -> Array:
     return np.full(len(parts), 1 / len(parts))
 
 
-def _by_pilots(allocator: Any, stats: Any, spp: float, rmse: float | None) -> Array:
-    seen = rounds.forecast(stats)
-    if rmse is not None:
-        spp = min(spp, allocator.required_spp(stats, seen, rmse))
-    return np.asarray(allocator.allocate(stats, seen, spp, 0.0))
-
-
 def _unsmoothed(variance: Array) -> Array:
     return np.sqrt(variance + 1e-30)
 
 
-def _one_field(build: Callable[..., None]) -> Callable[..., None]:
-    def construct(allocator: Any, *arguments: Any) -> None:
-        build(allocator, *arguments)
-        allocator._fields = [np.ones(allocator.film.shape, bool)]
-
-    return construct
-
-
 ABLATIONS: dict[str, list[Change]] = {
     "equal weights in the mixture": [(estimate, "_mixture", _equal_weights)],
-    "one window of 5 x 5": [(estimate, "WINDOWS", (2, 2, 2, 2))],
+    "one window of 5 x 5": [(estimate, "WINDOWS", (2, 2))],
     "no smoothing of deviations": [(allocate, "_smoothed", _unsmoothed)],
-    "pilots decide the last round": [(allocate.Allocator, "allocate_final", _by_pilots)],
-    "no chessboard": [(allocate.Allocator, "__init__", _one_field(allocate.Allocator.__init__))],
-    "no measured spread of errors": [(allocate, "_spread_like", lambda estimated, *_: estimated)],
-    "no measured gain": [(allocate.Allocator, "_measured_gain", lambda *_: 0.0)],
-    "no calibration of the last round": [(allocate, "calibration", lambda *_: 1.0)],
-    "PILOT_RATIO 1/15 for all": [(allocate, "PILOT_RATIO", (1 / 15, 1 / 15))],
-    "PILOT_RATIO 1/8 for all": [(allocate, "PILOT_RATIO", (1 / 8, 1 / 8))],
+    "PILOT_RATIO 1/24": [(allocate, "PILOT_RATIO", 1 / 24)],
+    "PILOT_RATIO 1/6": [(allocate, "PILOT_RATIO", 1 / 6)],
     "GROWTH 8": [(rounds, "GROWTH", 8.0)],
-    "no MIN_RELATIVE_DEVIATION": [(rounds, "MIN_RELATIVE_DEVIATION", 0.0)],
     "no MIN_RAYS": [(rounds, "MIN_RAYS", 0)],
+    "TRUSTED_GROWTH 4": [(rounds, "TRUSTED_GROWTH", 4.0)],
     "no SAFETY": [(rounds, "SAFETY", 0.0)],
 }
 
