@@ -207,12 +207,19 @@ def _layer_of(channels: Mapping[str, Array], headers: Mapping[str, Any], layer: 
     if not keys:
         raise UsageError(f"{name} has no layer {layer or 'R, G, B'!r}; it has {', '.join(sorted(groups))}")
     window = tuple(int(n) for corner in (headers[keys[0]]["dataWindow"] if headers else ()) for n in corner)
-    noise = "variance" if "variance" in groups else "error"  # which may be in another metric
-    wanted = [keys] if layer or noise not in groups else [keys, groups[noise]]
-    found, *known = (np.stack([channels[c] for c in names], -1, dtype=np.float64) for names in wanted)
-    if not known:
+    found = _stacked(channels, keys)
+    if layer:
         return found, None, window
-    return found, known[0] if noise == "variance" else known[0] ** 2, window
+    if "variance" in groups:
+        return found, _stacked(channels, groups["variance"]), window
+    if "error" in groups:  # of linear values, unless another metric was asked for
+        return found, _stacked(channels, groups["error"]) ** 2, window
+    return found, None, window
+
+
+def _stacked(channels: Mapping[str, Array], names: Sequence[str]) -> Array:
+    """Return channels as an array [H, W, names]."""
+    return np.stack([channels[name] for name in names], -1, dtype=np.float64)
 
 
 def _p_value(sides: Sequence[Layer]) -> float | None:

@@ -160,17 +160,23 @@ def run_rounds(
     if denoiser and denoised is None and not denoiser.left_out and target != 0:
         denoised = denoiser.mixture(stats, plain)
         done[-1] = replace(now, rmse=denoised.rmse, seconds=time.perf_counter() - start)
-    now = done[-1]
-    error = replace(estimate_error(stats, blurred), target=target)
-    if denoised is not None:
-        high = denoised.high if error.tail <= PARETO_K_THRESHOLD else math.inf
-        error = replace(error, rmse=denoised.rmse, low=denoised.low, high=high)
-    warnings = [stats.invalid_warning(), _tail_warning(error)]
-    if not stopped:
-        warnings.append(_target_warning(goal, now, target))
-    if any(warnings):
-        warn("; ".join(filter(None, warnings)))
+    error = replace(_final_error(stats, blurred, denoised), target=target)
+    missed = "" if stopped else _target_warning(goal, done[-1], target)
+    warnings = "; ".join(filter(None, [stats.invalid_warning(), _tail_warning(error), missed]))
+    if warnings:
+        warn(warnings)
     return Finished(done, stats, error, denoised)
+
+
+def _final_error(
+    stats: SampleStatistics, blurred: Blurred | None, denoised: Denoised | None
+) -> ErrorEstimate:
+    """Return the error of the picture, or of the one that a denoiser mixes."""
+    error = estimate_error(stats, blurred)
+    if denoised is None:
+        return error
+    high = denoised.high if error.tail <= PARETO_K_THRESHOLD else math.inf
+    return replace(error, rmse=denoised.rmse, low=denoised.low, high=high)
 
 
 def plan_round(
