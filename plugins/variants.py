@@ -39,7 +39,7 @@ def plain(number: mi.Float) -> mi.Float:
     return number if is_jit() else first(number)
 
 
-def but_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
+def and_not(mask: mi.Bool, excluded: mi.Bool) -> mi.Bool:
     """Return ``mask & ~excluded``; on a Python bool, ~ gives a number."""
     return mask & ~excluded if is_jit() else mask and not excluded
 

@@ -13,7 +13,7 @@ import numpy as np
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.interrupts import defer_signals
-from mrt_mitsuba.plugins.whitted.snapshot import Part
+from mrt_mitsuba.plugins.whitted.snapshot import SnapshotPart
 from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
 from mrt_mitsuba.rendering.exposing import Exposer
 from mrt_mitsuba.rendering.film import Film
@@ -33,7 +33,7 @@ class Prepared:
     """
 
     _source: Any = None  # the open scene
-    _state: Part | None = None  # of camera and integrator, for which the kernels were recorded
+    _state: SnapshotPart | None = None  # of camera and integrator, for which the kernels were recorded
     _exposer: Any = None  # whose kernels are recorded
     _launch: Any = None  # what launches them; None where nothing is recorded
 
@@ -87,9 +87,9 @@ class Prepared:
             self._job = job
         return self._made
 
-    def _look(self) -> Part:
+    def _look(self) -> SnapshotPart:
         """The state of the camera and the integrator, the same object if it is the same."""
-        now = Part()
+        now = SnapshotPart()
         settings = vars(self._source.integrator)
         now.add(self._source.sensor, ())
         now.state += [settings[name] for name in sorted(settings) if not name.startswith("_")]

@@ -16,7 +16,7 @@ from .lights import brightness, light_rows
 from .materials import has_mirror, is_anisotropic, is_mrt_bsdf, is_textured, material_rows
 from .plan import Mirror, SceneFacts
 from .shapes import is_sphere
-from .snapshot import Kept, Snapshot
+from .snapshot import Cache, Snapshot
 
 # Beyond these sizes, Embree's products of three lengths leave float32
 MIN_MESH_EXTENT = 1e-8
@@ -24,7 +24,7 @@ MAX_MESH_COORDINATE = 1e10
 
 
 class Reading:
-    """A snapshot of a scene and the facts in it; ``kept`` holds those of parts that have not changed since.
+    """A snapshot of a scene and the facts in it; ``cache`` holds those of parts that have not changed since.
 
     What the kernels may do in place of calling a plugin is known by its class: an ``MrtPlane`` has an
     equation, an ``AxialMesh`` or ``MrtGroup`` stands for quadrics, an ``MrtBSDF`` is a row of a table, and so
@@ -32,7 +32,7 @@ class Reading:
     may do anything, and is called.
     """
 
-    def __init__(self, snapshot: Snapshot, kept: Kept) -> None:
+    def __init__(self, snapshot: Snapshot, cache: Cache) -> None:
         self.snapshot = snapshot
         shapes = snapshot.shape_part
         materials = snapshot.material_part
@@ -43,10 +43,10 @@ class Reading:
         analytic = {id(s) for s in (*self.planes, *self.quadrics)}
         self.native = [s for s in snapshot.shapes if id(s) not in analytic]
         #: the rows of the materials by shape, none where they have no place in one table
-        self.materials, of_materials = kept("material facts", (shapes, materials), _read_materials, snapshot)
-        of_shapes = kept("shape facts", shapes, self._read_shapes)
+        self.materials, of_materials = cache("material facts", (shapes, materials), _read_materials, snapshot)
+        of_shapes = cache("shape facts", shapes, self._read_shapes)
         #: the lights, and their rows where all have one
-        self.lights, self.light_rows, of_lights = kept("light facts", lights, _read_lights, snapshot)
+        self.lights, self.light_rows, of_lights = cache("light facts", lights, _read_lights, snapshot)
         self.facts = SceneFacts(
             **of_lights,
             **of_materials,

@@ -17,12 +17,12 @@ import mitsuba as mi
 
 from ..parameters import LARGEST, ParameterError, PluginError, choice, flag, integer, number, spectrum
 from ..signals import left_to_other_threads
-from ..variants import but_not, construct_quietly, largest
+from ..variants import and_not, construct_quietly, largest
 from .buffers import PointBuffer
 from .facts import Reading
 from .plan import BUDGETS, KernelPlan, SceneFacts, make_plan
 from .scene_data import Hit, SceneData
-from .snapshot import Kept, Snapshot
+from .snapshot import Cache, Snapshot
 
 # A sixteenth of a step of an 8-bit picture: the sum of many cut paths stays below half a step, and on average
 # over the report's scenes below 1e-5
@@ -128,7 +128,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         self.min_contribution = number(props, "min_contribution", MIN_CONTRIBUTION, least=0)
         self.bounce_budget = choice(props, "bounce_budget", BUDGETS)
         self._snapshot: Snapshot | None = None  # of the scene that was looked at last
-        self._made = Kept()
+        self._cache = Cache()
         self._warned = False  # of outlines
         self._rendering: SceneData | None = None  # what ``sample`` traces while ``render`` runs
 
@@ -188,8 +188,8 @@ class MrtWhitted(mi.SamplingIntegrator):
         if self._snapshot.shape_part.differentiated and not self._warned:
             self._warned = True
             mi.Log(mi.LogLevel.Warn, DISCONTINUITY_WARNING)
-        reading = Reading(self._snapshot, self._made)
-        return SceneData(scene, reading, plan or self.kernel_plan(reading.facts), self._made)
+        reading = Reading(self._snapshot, self._cache)
+        return SceneData(scene, reading, plan or self.kernel_plan(reading.facts), self._cache)
 
     # ------------------------------------------- Tracing -----------------------------------------------
 
@@ -286,7 +286,7 @@ class MrtWhitted(mi.SamplingIntegrator):
             si = dr.zeros(mi.SurfaceInteraction3f)
             si.wi = -path.ray.d
             si.wavelengths = path.ray.wavelengths
-            away = but_not(path.active, hit.found)
+            away = and_not(path.active, hit.found)
             sky = self.sky if data.plan.sky == "parameter" else data.environment
             radiance += dr.select(away, mi.unpolarized_spectrum(sky.eval(si, away)), 0)
         return radiance, *others
@@ -349,7 +349,7 @@ class MrtWhitted(mi.SamplingIntegrator):
                 value = dr.clip(value, 0, 1)
             share = dr.max(dr.abs(throughput * value))
             traced = lit & (share * data.plan.contribution_bounds[1] > self.min_contribution)
-            visible = but_not(lit, data.occluded(hit, light, ds, traced))
+            visible = and_not(lit, data.occluded(hit, light, ds, traced))
             radiance = radiance + dr.select(visible, value, 0)
             shadow_rays = shadow_rays + dr.select(traced, mi.UInt32(1), mi.UInt32(0))
         return Sums(radiance, shadow_rays, sums.sampler), reflectance, int_ior

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..lobes import LOBES, Pair
-from ..variants import but_not, is_jit
+from ..variants import and_not, is_jit
 from .buffers import PointBuffer
 from .facts import Reading
 from .hit_errors import HitErrors
@@ -23,7 +23,7 @@ from .materials import MaterialTable, has_mirror
 from .plan import KernelPlan, SceneFacts
 from .quadrics import Quadrics
 from .shapes import Planes, Spheres
-from .snapshot import Kept
+from .snapshot import Cache
 
 # Relative shortening of shadow rays, so that a surface on which a light lies does not occlude it
 SHADOW_EPSILON = 2.0**-14
@@ -57,31 +57,31 @@ class Traced:
 class SceneData:
     """The data of the kernels for a scene, as a plan wants them, and its ray queries.
 
-    ``kept`` holds the data made of parts of the scene that have not changed since.
+    ``cache`` holds the data made of parts of the scene that have not changed since.
     """
 
-    def __init__(self, scene: mi.Scene, reading: Reading, plan: KernelPlan, kept: Kept) -> None:
+    def __init__(self, scene: mi.Scene, reading: Reading, plan: KernelPlan, cache: Cache) -> None:
         now = reading.snapshot
         self.scene = scene
         self.plan = plan
         self.facts = reading.facts
         self.environment = now.environment
-        self._kept = kept
+        self._cache = cache
         self._shape_key = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
         self.known = now.material_part.known and now.light_part.known
-        traced = kept("traced", self._shape_key, _trace, reading, plan)
+        traced = cache("traced", self._shape_key, _trace, reading, plan)
         self.bvh = traced.bvh or scene
         self.planes = traced.planes
         self.quadrics = traced.quadrics
         self.errors = traced.errors
         self.spheres = traced.spheres
-        self.lights = kept("lights", (now.light_part, plan.lights), _lights, reading, plan)
+        self.lights = cache("lights", (now.light_part, plan.lights), _lights, reading, plan)
         light_key = now.light_part, plan.light_buffers, *self._shape_key
-        self.light_buffers = kept("light buffers", light_key, _light_buffers, reading, plan, traced)
+        self.light_buffers = cache("light buffers", light_key, _light_buffers, reading, plan, traced)
         eye_key = now.eye, plan.eye_buffer, *self._shape_key
-        self.eye_buffer = kept("eye buffer", eye_key, _eye_buffer, reading, plan, traced)
+        self.eye_buffer = cache("eye buffer", eye_key, _eye_buffer, reading, plan, traced)
         material_key = now.shape_part, now.material_part, plan.merged
-        self.merged = kept("merged", material_key, _material_table, reading, plan)
+        self.merged = cache("merged", material_key, _material_table, reading, plan)
         self.path_bound = _path_bound(reading.facts, plan)
         self.ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
         self.ray_flags |= +mi.RayFlags.dPdUV if plan.tangents else 0
@@ -96,7 +96,7 @@ class SceneData:
         tabulated = tabulated and (plan.spheres == "table" or not plan.bvh)
         if not tabulated or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
             return None
-        rays = self._kept("rays", self._shape_key, _ray_arrays, self.bvh) if plan.bvh else []
+        rays = self._cache("rays", self._shape_key, _ray_arrays, self.bvh) if plan.bvh else []
         own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged]
         return [*_arrays_in([*own, self.light_buffers, self.eye_buffer]), *rays, self.path_bound, sky]
 
@@ -130,7 +130,7 @@ class SceneData:
             scale = self.quadrics.fill_interaction(si, ray, quadric, closer, scale, tangents=plan.tangents)
             found = found | closer
         if plan.planes:
-            on_plane = but_not(on_plane, found)
+            on_plane = and_not(on_plane, found)
             scale = self.planes.fill_interaction(si, ray, plane, on_plane, scale, tangents=plan.tangents)
             found = found | on_plane
         si.sh_frame = _frame_along(si) if plan.tangents else mi.Frame3f(si.sh_frame.n)
@@ -151,13 +151,13 @@ class SceneData:
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)
         for buffer, things in self.light_buffers:
             test = partial(things.block, ray=ray)
-            blocked |= buffer.any(light, to_light, but_not(active, blocked), test)
+            blocked |= buffer.any(light, to_light, and_not(active, blocked), test)
         if self.light_buffers:
             return blocked
         if self.plan.bvh:
-            blocked |= self.bvh.ray_test(ray, self.plan.coherent, but_not(active, blocked))
+            blocked |= self.bvh.ray_test(ray, self.plan.coherent, and_not(active, blocked))
         if self.quadrics is not None:
-            blocked |= self.quadrics.occluded(ray, but_not(active, blocked))
+            blocked |= self.quadrics.occluded(ray, and_not(active, blocked))
         return blocked
 
     def mirror_ray(self, ray: mi.Ray3f, hit: Hit) -> mi.Ray3f:

@@ -9,7 +9,7 @@ to tell.
 Numbers may also be written where they lie, through an array of NumPy's: no index shows that, but an update by
 ``mi.traverse`` does (``updates``). What somebody else wrote in Python may depend on anything.
 
-What is made of a part is kept with that part as its key (``Kept``). A part that has not changed since the
+What is made of a part is cache with that part as its key (``Cache``). A part that has not changed since the
 last snapshot is the same object as then; one with derivatives never is, as what was made of it has none, nor
 one of materials or lights with a class that is somebody else's.
 """
@@ -57,7 +57,7 @@ updates = Updates()
 
 
 @dataclass(eq=False)
-class Part:
+class SnapshotPart:
     """Some objects with their textures and the like, as they are; equal to itself only."""
 
     state: list[Any] = field(default_factory=list)  # what is compared
@@ -111,7 +111,7 @@ class Part:
             self.state.append(id(value))
             self._held[id(value)] = value
 
-    def close(self, before: Part | None) -> Part:
+    def close(self, before: SnapshotPart | None) -> SnapshotPart:
         """Return the part from ``before`` if nothing has changed since, else this one."""
         self.differentiated = dr.grad_enabled(self._arrays)
         self.comparable = self.comparable and not self.differentiated
@@ -138,9 +138,9 @@ class Snapshot:
         self.groups = [shape for shape in inside if shape.class_name().startswith("ShapeGroup")]
         #: the shapes of the groups
         self.inner = [v for g in self.groups for _, v, _ in parameters_of(g) if isinstance(v, mi.Shape)]
-        shapes = Part()
-        materials = Part()
-        lights = Part()
+        shapes = SnapshotPart()
+        materials = SnapshotPart()
+        lights = SnapshotPart()
         for shape in [*self.shapes, *self.groups, *self.inner]:
             elsewhere = (mi.Shape, mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium)
             shapes.add(shape, elsewhere, shape.has_flipped_normals(), shape.is_emitter())
@@ -152,12 +152,12 @@ class Snapshot:
         for emitter in self.emitters:
             lights.add(emitter, (mi.Shape, mi.Medium), emitter.flags())
         lights.add(self.environment, (mi.Shape, mi.Medium))
-        self.shape_part: Part = shapes.close(before.shape_part if before else None)
-        self.material_part: Part = materials.close(before.material_part if before else None)
-        self.light_part: Part = lights.close(before.light_part if before else None)
+        self.shape_part: SnapshotPart = shapes.close(before.shape_part if before else None)
+        self.material_part: SnapshotPart = materials.close(before.material_part if before else None)
+        self.light_part: SnapshotPart = lights.close(before.light_part if before else None)
 
 
-class Kept(dict[str, tuple[Hashable, Any]]):
+class Cache(dict[str, tuple[Hashable, Any]]):
     """One-entry cache per name, keyed by all dependencies."""
 
     def __call__(self, name: str, key: Hashable, make: Callable[..., Value], *arguments: object) -> Value:

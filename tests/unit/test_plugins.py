@@ -17,7 +17,7 @@ from mrt_mitsuba.plugins.lobes import LOBES, Lobes, Pair
 from mrt_mitsuba.plugins.table import PLUGINS, Plugin, names_in
 from mrt_mitsuba.plugins.whitted import facts
 from mrt_mitsuba.plugins.whitted.materials import material_rows
-from mrt_mitsuba.plugins.whitted.snapshot import Kept, Snapshot
+from mrt_mitsuba.plugins.whitted.snapshot import Cache, Snapshot
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -208,7 +208,7 @@ def test_a_lobe_is_left_out_only_with_all_of_its_flag(monkeypatch):
     rows = [np.vstack([row[:3], np.zeros_like(row[:1])]) for row in material_rows(scene.shapes())[0]]
     monkeypatch.setattr(facts, "LOBES", (*LOBES[:2], Sheen()))
     monkeypatch.setattr(facts, "material_rows", lambda shapes: (rows, ""))
-    found = facts.Reading(Snapshot(scene, None), Kept()).facts.lobes
+    found = facts.Reading(Snapshot(scene, None), Cache()).facts.lobes
     assert found == (("diffuse", True), ("specular", False), ("sheen", True))
 
 
