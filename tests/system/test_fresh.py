@@ -28,7 +28,11 @@ RED, GREEN = ({"type": "mrt_bsdf", "diffuse_reflectance": color} for color in CO
 
 
 def content(fresnel: str) -> dict[str, Any]:
-    nodes: dict[str, Any] = {"type": "scene", "sensor": sensor([0, 2, 7], [0, 0.5, 0], (12, 9))}
+    nodes: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted"},
+        "sensor": sensor([0, 2, 7], [0, 0.5, 0], (12, 9)),
+    }
     nodes["light"] = {"type": "mrt_light", "position": [3, 5, 4]}
     nodes["sky"] = {"type": "constant", "radiance": 0.3}
     for k in range(4):
@@ -163,7 +167,12 @@ SIZES = {
 @pytest.mark.parametrize("options", [{"aa": 1, "aamode": "none"}, {}, {"spp": 2}], ids=str)
 @pytest.mark.parametrize("change", SIZES)
 def test_a_prepared_scene_follows_the_size_of_its_film(variant, options, change):
-    nodes = {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}}
+    nodes = {
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted"},
+        "ball": {"type": "sphere"},
+        "sky": {"type": "constant"},
+    }
     scene = mi.load_dict(nodes | {"eye": sensor([0, 1, 6], [0, 0, 0], (16, 12), fov=25)})
     again = mrt.prepare(scene, **options)
     before = again()
@@ -180,7 +189,12 @@ def test_a_prepared_scene_follows_the_size_of_its_film(variant, options, change)
 @pytest.mark.parametrize("change", [{"size": [0, 0]}, {"size": [9, 0]}, {"crop_size": [0, 3]}], ids=str)
 def test_a_prepared_scene_refuses_a_film_without_pixels(variant, change):
     """The message spoke of a region, which nobody had given."""
-    nodes = {"type": "scene", "sky": {"type": "constant"}, "eye": sensor([0, 1, 6], [0, 0, 0], (16, 12))}
+    nodes = {
+        "type": "scene",
+        "integrator": {"type": "mrt_whitted"},
+        "sky": {"type": "constant"},
+        "eye": sensor([0, 1, 6], [0, 0, 0], (16, 12)),
+    }
     again = mrt.prepare(mi.load_dict(nodes), aa=1, aamode="none")
     before = again().image
     known = {name: list(again.params[f"eye.film.{name}"]) for name in ("size", "crop_size")}
