@@ -189,7 +189,8 @@ class Passes:
         seed = derived_seed(self._plan.seed, features=1)
         with left_to_other_threads():
             picture = aov.render(self._shader.scene, self._shader.sensor, seed=seed, spp=FEATURE_SPP)
-        return tuple(np.split(np.array(picture, np.float32)[..., -6:], 2, axis=-1))
+        albedo, normal = np.split(np.array(picture, np.float32)[..., -6:], 2, axis=-1)
+        return albedo, normal
 
     def _develop(self, exposer: Exposer, picture: np.ndarray) -> None:
         """Write an exposed picture [H, W, channels] into layers."""

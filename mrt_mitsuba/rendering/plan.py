@@ -395,7 +395,7 @@ def _check(
         raise UsageError(f"region={given.region}: it exceeds the picture, {size}")
 
 
-def _refuse(settings: RenderSettings, options: Sequence[str], allowed: Sequence[str], text: str) -> None:
+def _refuse(settings: RenderSettings, options: Sequence[str], allowed: Sequence[Any], text: str) -> None:
     """Raise ``UsageError`` for the first of some options with a value that is not allowed.
 
     ``text``: the message, with places for its name and its value.
