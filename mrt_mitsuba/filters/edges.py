@@ -1,4 +1,4 @@
-"""Edge detectors: which pixels of a picture are worth tracing again.
+"""Edge detectors: which pixels of a picture need further samples.
 
 ``luma_edges`` and ``sobel_edges`` are the two of the original ray tracer, number for number; they read the
 picture. ``geometry_edges`` reads normals and distances instead, so it sees outlines however faint and never a

@@ -1,4 +1,4 @@
-"""What rays add up to on a film."""
+"""Sums of ray values under the filter of a film."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Canvas:
     """
 
     def __init__(self, film: Film, rays: np.ndarray, channels: int, *, moments: bool) -> None:
-        """Take up values of so many channels of so many rays in each pixel, [pictures, pixels]."""
+        """Allocate for ``rays[picture, pixel]`` rays of ``channels`` values each."""
         self.rays = rays
         self._film = film
         self._share = np.float32(1 / np.maximum(rays, 1)).ravel()  # of a ray among those of its pixel
@@ -68,7 +68,7 @@ class Canvas:
             self._put_rows(some, rows.start * film.width, rows.stop * film.width)
 
     def _put_rows(self, rays: _Rays, low: int, high: int) -> None:
-        """Add what rays give that start in pixels from ``low`` to below ``high``, which are whole rows."""
+        """Accumulate rays that start in pixels [low, high), which are whole rows."""
         film = self._film
         first = 0
         channels = len(self._sums)
@@ -132,8 +132,8 @@ class _Rays:
     film: Film
 
     def moments(self, low: int, high: int) -> list[mi.Float]:
-        """Sums of the colours of the rays in each pixel, sums of their squares, and the largest mean colour
-        of a ray, or 0."""
+        """Return sums of the colours of the rays in each pixel, sums of their squares, and the largest mean
+        colour of a ray, or 0."""
 
         def add(ray: mi.UInt32, sums: list[mi.Float], peak: mi.Float) -> tuple:
             colors = [dr.gather(mi.Float, value, ray) for value in self.values[:3]]
@@ -148,8 +148,8 @@ class _Rays:
         return [*sums, peak]
 
     def filtered(self, low: int, high: int, channels: range, down: range, across: range) -> list[mi.Float]:
-        """What the rays in each pixel contribute to the pixels at some offsets: by row and column of the
-        offsets, and by channel."""
+        """Return what the rays in each pixel contribute to the pixels at some offsets: by row and column of
+        the offsets, and by channel."""
         evaluate = self.film.rfilter.eval
         pixel = dr.arange(mi.UInt32, high - low) + opaque(low)
         line, column = divide(pixel, self.film.width)
@@ -180,7 +180,7 @@ class _Rays:
     def gathered(
         self, sums: Sequence[mi.Float], low: int, high: int, begin: int, end: int, down: range, across: range
     ) -> list[mi.Float64]:
-        """What reaches the pixels from ``begin`` to below ``end``, by channel; see ``filtered``."""
+        """Return the contributions to pixels [begin, end), by channel; see ``filtered``."""
         width = opaque(self.film.width)
         height = opaque(self.film.height)
         pixel = dr.arange(mi.UInt32, end - begin) + opaque(begin)
