@@ -97,7 +97,7 @@ def test_meshes_are_drawn_at_every_size_that_is_taken(variant, size):
 
     def picture(s: float) -> np.ndarray:
         clips = {"near_clip": 0.01 * s, "far_clip": 1e4 * s}
-        scene = {"type": "scene", "embree_use_robust_intersections": True}
+        scene = {"type": "scene", "integrator": WHITTED, "embree_use_robust_intersections": True}
         scene["sensor"] = sensor([0, 0, 6 * s], [0, 0, 0], (48, 36), fov=30, **clips)
         scene["light"] = {"type": "mrt_light", "position": [2 * s, 3 * s, 5 * s]}
         scene["mesh"] = mesh(corners * s, faces) | {"bsdf": {"type": "mrt_bsdf"}}
