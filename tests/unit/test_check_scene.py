@@ -206,6 +206,10 @@ def no_number(weight, u, ds):
     return dr.select(u.x > 0.99, dr.nan, weight)
 
 
+def no_number_at_the_end(weight, u, ds):
+    return dr.select(u.x > 1 - 1e-7, dr.nan, weight)
+
+
 def negative(weight, u, ds):
     return -weight
 
@@ -230,6 +234,7 @@ MISTAKES = {
     "wrong distance": Mistake("direction", nearer, {"sampling"}),
     "direction too long": Mistake("direction", too_long, {"sampling", "finite"}),
     "NaN": Mistake("weight", no_number, {"finite"}),
+    "NaN for the last number": Mistake("weight", no_number_at_the_end, {"finite"}),
     "negative": Mistake("weight", negative, {"finite", "weights"}),
 }
 IN_A_SCENE = ("none", "density x 1.01", "half of the sky", "NaN")  # each law is missed by one of them

@@ -48,6 +48,7 @@ DIRECTION_TOL = 4 * probe.DIRECTION_EPS  # a direction passes through angles, a 
 SPOILS = "one such number spoils a picture"
 LENGTH_TOL = 1e-4  # relative: a square root, and the difference of two points
 RETRY_P_VALUE = 1e-3  # chance below which the integral over a cell is computed again
+ENDS = (0, 0.5, 1 - 2.0**-24)  # and the middle
 REPEATS = 64
 BATCH = 256  # cells that are computed again at a time
 MAX_UNSAMPLED_LIGHT = 5e-5  # share of the light: a fifth of a cone of 3 degrees
@@ -151,8 +152,11 @@ class EmitterCase(Case):
         """A sample for each point."""
         return self.sample(self.points)
 
-    def sample(self, points: Array) -> Lanes:
-        """A sample for each point; ``again``: pdf_direction(), ``value``: eval_direction()."""
+    def sample(self, points: Array, extreme: float = 0) -> Lanes:
+        """A sample for each point; ``again``: pdf_direction(), ``value``: eval_direction().
+
+        ``extreme``: the share of random numbers at the ends of their range.
+        """
         sample = method(self.plugin, "sample_direction")
         light = method(self.plugin, "eval_direction")
         density = method(self.plugin, "pdf_direction")
@@ -163,6 +167,9 @@ class EmitterCase(Case):
             return [ds.p, ds.d, ds.dist, ds.pdf, density(it, ds), ds.delta, weight, light(it, ds)]
 
         u = self.uniform(len(points), 2)
+        if extreme:
+            ends = self.rng.choice(np.float32(ENDS), u.shape)
+            u = np.where(self.rng.random(u.shape) < extreme, ends, u)
         try:
             columns = lanes(call, ("Point3f", points), ("Point2f", u))
         except (NotImplementedError, RuntimeError) as error:
@@ -432,7 +439,7 @@ def weights(law: Outcome, case: EmitterCase) -> None:
 def finite(law: Outcome, case: EmitterCase) -> None:
     """Samples are finite, directions have unit length, and weights and densities are not negative."""
     with reads_checked(law):
-        s = case.sample(case.points)
+        s = case.sample(case.points, extreme=0.4)
         sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
         length = abs(norm(np.float64(s.d), axis=1) - 1)
         usable = (length <= LENGTH_TOL) & np.isfinite(s.dist) & (s.pdf >= 0)
