@@ -1,17 +1,17 @@
-"""The drawing of the architecture page: rooms of the project, and the data that goes from one to another."""
+"""The drawing of the architecture page: packages of the project, and the data that flows between them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 820 430" font-family="sans-serif"
-  font-size="13" role="img" aria-label="The rooms of the project and the way of data through them">
+  font-size="13" role="img" aria-label="The packages of the project and the data that flows between them">
   <defs>
     <marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">
       <path d="M0 0 L8 4 L0 8 z" fill="#456"/>
     </marker>
     <style>
-      .room { fill: #eef3f8; stroke: #9ab; } .part { fill: #fdf3e1; stroke: #cb9; }
+      .package { fill: #eef3f8; stroke: #9ab; } .part { fill: #fdf3e1; stroke: #cb9; }
       .name { font-weight: bold; } .data { font-style: italic; fill: #456; font-size: 12px; }
       .small { font-size: 11px; fill: #333; }
       .way { stroke: #456; fill: none; marker-end: url(#tip); }
@@ -22,7 +22,7 @@ HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 820 430" font-fam
 
 @dataclass(frozen=True)
 class Box:
-    """A room, or a part of one; place and size in pixels."""
+    """A package, or a part of one; place and size in pixels."""
 
     name: str
     x: int
@@ -30,7 +30,7 @@ class Box:
     width: int
     height: int
     lines: tuple[str, ...] = ()
-    look: str = "room"
+    look: str = "package"
 
     def svg(self) -> list[str]:
         frame = f'x="{self.x}" y="{self.y}" width="{self.width}" height="{self.height}" rx="6"'
@@ -44,7 +44,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Way:
-    """What goes from one room to another; the label begins at a place."""
+    """Data that flows from one package to another; ``x`` and ``y`` place the label."""
 
     path: str
     label: str = ""
@@ -57,57 +57,57 @@ class Way:
 
 
 BOXES = (
-    Box("command/", 20, 20, 150, 80, ("words to options,", "banner, exit codes")),
-    Box("scene/", 20, 160, 150, 90, ("numbers, Scene, dict,", "XML, OBJ to a Mitsuba", "scene")),
-    Box("rays/", 20, 320, 150, 90, ("where, when and with", "which random numbers;", "canvases of films")),
-    Box("rendering/", 235, 20, 350, 250),
-    Box("settings", 255, 56, 140, 50, ("checked options",), "part"),
-    Box("plan", 425, 106, 140, 64, ("kernels, layers, and a", "dataclass for each pass"), "part"),
-    Box("passes, exposing", 425, 200, 140, 52, ("run what the plan says",), "part"),
-    Box("rounds, noise", 255, 130, 140, 52, ("where rays go, error",), "part"),
-    Box("shading", 255, 206, 140, 46, ("calls the integrator",), "part"),
+    Box("command/", 20, 20, 150, 76, ("words to options,", "help, exit codes")),
+    Box("scene/", 20, 150, 150, 90, ("number, Scene, dict,", "XML or OBJ to a", "Mitsuba scene")),
     Box(
         "plugins/",
-        235,
-        320,
-        160,
-        90,
-        ("integrator, BSDF, shapes,", "lights; facts and plan", "of their kernels"),
+        20,
+        310,
+        150,
+        110,
+        ("integrator, BSDF,", "shapes, lights;", "whitted/: facts, plan", "and data of kernels"),
+    ),
+    Box("rendering/", 225, 20, 370, 220),
+    Box("settings", 245, 56, 150, 48, ("checked options",), "part"),
+    Box("plan", 425, 56, 150, 64, ("kernels, layers, and a", "dataclass for each pass"), "part"),
+    Box("shading", 245, 166, 150, 52, ("calls the integrator",), "part"),
+    Box("passes, exposing", 425, 166, 150, 52, ("run what the plan says",), "part"),
+    Box(
+        "adaptive/",
+        225,
+        310,
+        170,
+        110,
+        ("half and pilot images;", "estimate, allocate,", "denoise; metrics,", "samplers"),
     ),
     Box(
         "filters/",
         425,
-        320,
-        160,
-        90,
-        ("edges, depth of field,", "contours: arrays in,", "arrays out"),
+        310,
+        170,
+        110,
+        ("edges, depth of field,", "denoising, contours:", "arrays in, arrays out"),
     ),
-    Box("sweeps/", 650, 20, 150, 80, ("grids, frames and tiles", "on many processes")),
-    Box("output/", 650, 160, 150, 90, ("table of layers,", "PNG and EXR")),
-    Box(
-        "validation/",
-        650,
-        320,
-        150,
-        90,
-        ("oracles, checks, studies,", "figures: judge all of it", "by its public names"),
-    ),
+    Box("sweeps/", 650, 20, 150, 76, ("grids, frames, seeds", "in many processes")),
+    Box("files/", 650, 150, 150, 90, ("table of layers,", "PNG and EXR")),
+    Box("validation/", 650, 310, 150, 110, ("references, studies,", "comparisons")),
+    Box("laws/", 660, 372, 130, 40, (), "part"),
 )
 WAYS = (
-    Way("M170 60 L253 76", "options", 176, 54),
-    Way("M395 84 L440 84 L480 104", "RenderSettings", 425, 76),
-    Way("M170 190 L200 190 L200 118 L423 118", "Source", 152, 140),
-    Way("M495 170 L495 198", "Plan", 502, 189),
-    Way("M425 214 L397 172"),
-    Way("M425 232 L397 232"),
-    Way("M95 318 L95 290 L480 290 L480 254", "starts, canvases", 105, 284),
-    Way("M290 252 L290 318", "rays", 296, 308),
-    Way("M340 318 L340 254", "radiance", 346, 308),
-    Way("M520 254 L520 318", "pictures", 468, 308),
-    Way("M550 318 L550 254", "edges, blur", 556, 308),
-    Way("M650 60 L587 60", "jobs", 604, 52),
-    Way("M565 226 L648 208", "Result", 596, 206),
-    Way("M725 318 L725 252", "reads", 732, 290),
+    Way("M170 58 L225 58 L243 74", "options", 176, 52),
+    Way("M395 80 L423 80", "RenderSettings", 372, 50),
+    Way("M170 190 L217 190 L217 136 L440 136 L440 122", "Source", 172, 184),
+    Way("M500 120 L500 164", "Plan", 507, 150),
+    Way("M425 184 L397 184", "rays", 399, 179),
+    Way("M395 206 L423 206", "radiance", 386, 234),
+    Way("M290 218 L290 274 L95 274 L95 308", "calls", 105, 268),
+    Way("M460 218 L460 258 L320 258 L320 308", "sums of samples", 328, 252),
+    Way("M360 308 L360 280 L482 280 L482 220", "allocation", 366, 294),
+    Way("M505 218 L505 308", "pictures", 511, 270),
+    Way("M570 308 L570 220", "edges, blur", 576, 292),
+    Way("M650 58 L597 58", "jobs", 612, 52),
+    Way("M575 194 L648 194", "Result", 605, 188),
+    Way("M725 310 L725 242", "reads", 732, 282),
 )
 
 
