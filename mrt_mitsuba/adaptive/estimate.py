@@ -257,8 +257,10 @@ def _blurred_variance(variance: np.ndarray, squares: np.ndarray, blurred: Blurre
     """Return variances [H, W, 3] after a blur, from blurred fields of noise, calibrated by squared errors."""
     random = np.random.default_rng(0)
     deviation = np.sqrt(variance)
-    fields = (blurred(deviation * random.standard_normal(variance.shape)) for _ in range(NOISE_FIELDS))
-    after = sum(np.square(field, dtype=np.float64) for field in fields) / NOISE_FIELDS
+    after = np.zeros(variance.shape)
+    for _ in range(NOISE_FIELDS):
+        field = blurred(deviation * random.standard_normal(variance.shape))
+        after += np.square(field, dtype=np.float64) / NOISE_FIELDS
     mean = after.mean(-1)
     return after * (_calibrated(mean, squares.mean(-1)) / np.maximum(mean, 1e-300))[..., None]
 

@@ -21,6 +21,7 @@ from mrt_mitsuba.adaptive.rounds import Tracer, run_rounds
 from mrt_mitsuba.adaptive.tails import PARETO_K_THRESHOLD, tail_shape
 from mrt_mitsuba.adaptive.target import Goal, Target
 from mrt_mitsuba.rendering.film import Film
+from mrt_mitsuba.rendering.settings import RenderSettings
 
 SIDE = 16
 PIXELS = SIDE**2
@@ -71,10 +72,17 @@ class Draws:
         return SimpleNamespace(sums=sums, weights=weights, rays=rays, total=total, square=square, peak=peak)
 
 
-def _render(exposer: Draws, seed: int = 0, target: Any = None, rays: int = 64, on_round: Any = None) -> Any:
+def _render(
+    exposer: Draws,
+    seed: int = 0,
+    target: Any = None,
+    rays: int = 64,
+    on_round: Any = None,
+    metric: str = "linear",
+) -> Any:
     """Return what a render of drawn values has."""
     tracer = Tracer(exposer, seed)  # type: ignore[arg-type]
-    aim = Goal(None if target is None else Target.of(target), rays)
+    aim = Goal(None if target is None else Target.of(target), rays, metric=metric)
     stage = lambda *_: nullcontext(lambda rays: None)  # noqa: E731
     done, stats, error, _ = run_rounds(tracer, stage, aim, on_round=on_round)
     return SimpleNamespace(
@@ -366,3 +374,19 @@ def test_shares_take_all_the_room_there_is_and_no_more(rfilter, least):
         allocation = tracer.allocator.allocate(stats, seen, most)
         taken = (tracer.cost(allocation) / PIXELS + 8) / most
         assert least < taken <= 1.005, most  # pilots are rounded by themselves
+
+
+@pytest.mark.parametrize(("maxspp", "spent"), [(None, 64), (32, 32), (1024, 64)])
+def test_the_smaller_of_two_limits_of_rays_counts(maxspp, spent):
+    goal = RenderSettings(aamode="noise", spp=64, maxspp=maxspp).goal()
+    assert goal is not None
+    assert goal.max_spp == spent
+
+
+@pytest.mark.parametrize("metric", ["relative", "display"])
+def test_errors_are_in_the_metric_that_is_asked_for(metric):
+    """Of calm values around 1: relative errors are as large, displayed ones a third to a half of that."""
+    error = _render(Draws(_calm), rays=64, metric=metric).error
+    plain = _render(Draws(_calm), rays=64).error
+    assert error.metric == metric
+    assert 0.2 < error.rmse / plain.rmse < (0.6 if metric == "display" else 1.3)
