@@ -48,7 +48,8 @@ class Denoiser:
         halves = [
             np.where(unknown, np.nan, stats.film.picture(half[..., :3])) for half in stats.halves.pictures()
         ]
-        found = denoise(*halves, *self._known, encode=stats.metric.encode)
+        albedo, normal = self._known
+        found = denoise(halves[0], halves[1], albedo, normal, encode=stats.metric.encode)
         plain = stats.image()[..., :3].astype(np.float32)
         self._measured = (plain_error, cautious_error(found))
         return replace(found, noisy=plain, image=np.where(unknown, plain, found.image))

@@ -95,7 +95,7 @@ def denoise(
     variance = np.maximum(window_means(squares, REACH), MIN_SHARE * typical)
     return Denoised(
         image=np.where(valid[..., None], mixed, noisy).astype(np.float32),
-        noisy=noisy,
+        noisy=noisy.astype(np.float32),
         weight=weight.astype(np.float32),
         error=np.sqrt(variance).astype(np.float32),
         rmse=rmse,
@@ -143,8 +143,12 @@ class _Estimates:
         noise = a - b
         change = fa - fb
         error = ((fa - b) ** 2 + (fb - a) ** 2 - noise**2) / 2 - change**2 / 4
-        planes = [np.where(valid, values.mean(-1), 0) for values in (noise**2 / 4, error, change * noise / 4)]
-        return cls(*planes, reach=_correlated_reach(np.where(valid, noise.mean(-1), 0)))
+        return cls(
+            variance=np.where(valid, np.square(noise).mean(-1) / 4, 0),
+            error=np.where(valid, error.mean(-1), 0),
+            covariance=np.where(valid, (change * noise).mean(-1) / 4, 0),
+            reach=_correlated_reach(np.where(valid, noise.mean(-1), 0)),
+        )
 
     def best_weight(self) -> np.ndarray:
         """Weight of the denoised picture with the least squared error, [H, W].

@@ -168,7 +168,7 @@ class EmitterCase(Case):
 
         u = self.uniform(len(points), 2)
         if extreme:
-            ends = self.rng.choice(np.float32(ENDS), u.shape)
+            ends = self.rng.choice(np.array(ENDS, np.float32), u.shape)
             u = np.where(self.rng.random(u.shape) < extreme, ends, u)
         try:
             columns = lanes(call, ("Point3f", points), ("Point2f", u))
