@@ -74,9 +74,13 @@ def ball_scene(bsdf: Node, *, size: int) -> mi.Scene:
 # ----------------------------------------------- Whole scenes -----------------------------------------------
 
 
-def load(name: str, width: int, height: int, *, film: Node | None = None, **more: Any) -> mi.Scene:
-    """Return a scene by name, at a size; ``film`` and further nodes replace its own."""
+def load(
+    name: str, width: int, height: int, *, film: Node | None = None, sampler: str = "", **more: Any
+) -> mi.Scene:
+    """Return a scene by name, at a size; ``film``, ``sampler`` and further nodes replace its own."""
     nodes = SCENES[name]()
+    if sampler:
+        nodes["sensor"]["sampler"]["type"] = sampler
     size = {"width": width, "height": height}
     if name == "crop":
         window = {"crop_offset_x": width // 4, "crop_offset_y": height // 4}
@@ -249,7 +253,7 @@ def stratified() -> Node:
 # --------------------------------------------- Kinds of noise ----------------------------------------------
 
 
-KINDS = ("calm", "texture", "lights", "gloss", "glass", "spot", "fog")
+KINDS = ("calm", "texture", "lights", "gloss", "glass", "spot", "fog", "crop")
 
 
 def load_room(
@@ -281,7 +285,9 @@ def load_room(
 
 
 def load_kind(kind: str, size: int, sampler: str = "multijitter", rfilter: str = "box") -> mi.Scene:
-    """Return a room with one of the ``KINDS`` of noise."""
+    """Return a room with one of the ``KINDS`` of noise; "crop" is the scene, with a filter of its own."""
+    if kind == "crop":
+        return load(kind, size, size, sampler=sampler)
     places = np.random.default_rng(1).uniform([-3, 1, -3], [3, 3, 3], (30, 3)).tolist()
     inside = {"type": "ref", "id": "fog"}
     kinds: dict[str, Node] = {
