@@ -71,6 +71,12 @@ def plots(*figures: Figure, width: str = "18rem") -> Html:
     return Html(f'<div class="plots" style="{style}">{"".join(images)}</div>')
 
 
+def animation(path: str) -> Html:
+    """Show a GIF."""
+    data = base64.b64encode(Path(path).read_bytes()).decode()
+    return Html(f'<img alt="animation" src="data:image/gif;base64,{data}">')
+
+
 class Markdown(str):
     """Text that a page shows as Markdown."""
 
