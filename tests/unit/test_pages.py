@@ -13,35 +13,35 @@ from mrt_mitsuba.plugins.table import PLUGINS
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 COLUMNS = 78  # wider lines are cut off at the right in a browser
-ALL = 16_000  # words, code included
+ALL = 16_500  # words, code included
 MOST = {
     "README": 900,
     "api": 330,
     "architecture": 900,
     "blender": 300,
     "check_your_plugin": 1500,
-    "command": 280,
+    "command": 340,
     "error_against_time": 560,
     "extreme_cases": 280,
     "filters": 640,
     "gallery": 180,
     "habits": 800,
-    "index": 220,
+    "index": 420,
     "ledger": 640,
     "left_out": 280,
     "limits": 640,
-    "maths": 3600,
+    "maths": 4100,
     "models": 540,
     "analyse_exr": 250,
     "recover_alpha": 330,
     "original": 220,
     "own_plugin": 640,
-    "own_scenes": 900,
+    "own_scenes": 950,
     "performance": 400,
     "plugins": 210 + 30 * len(PLUGINS),
     "robustness": 490,
     "sweeps": 540,
-    "tutorial": 540,
+    "tutorial": 600,
     "validation": 560,
 }
 PAGES = {path.stem: path for path in (ROOT / "README.md", *DOCS.glob("*.md"), *DOCS.glob("*.rst"))}
