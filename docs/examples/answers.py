@@ -160,7 +160,8 @@ def original() -> Answer:
     drawn, rows = originals.side_by_side(pages.ORIGINALS)
     assert max(row["mean difference"] for row in rows) < 3e-4
     return answer(
-        "On average, our pictures are within 3e-4 of the original's.",
+        "The rebuilt renders differ from the original's by less than 3e-4 "
+        "on average.",
         [drawn],
         rows,
         width="40rem",

@@ -162,7 +162,7 @@ def test_the_memory_that_a_picture_would_need_is_as_shown(capsys):
 def test_every_study_and_every_plugin_is_explained():
     explained = re.findall(r"^\| `([\w-]+)` \|", (DOCS / "validation.md").read_text(), flags=re.MULTILINE)
     assert sorted(explained) == sorted(cli.STUDIES)
-    named = re.findall(r"mrt_mitsuba\.plugins\.(\w+)\.", (DOCS / "plugins.rst").read_text())
+    named = re.findall(r"mrt_mitsuba\.plugins\.([\w.]+)\.\w+", (DOCS / "plugins.rst").read_text())
     assert set(named) == {row.module for row in plugins.PLUGINS}
 
 
