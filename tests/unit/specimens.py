@@ -13,11 +13,8 @@ from mrt_mitsuba.plugins.variants import is_jit, updatable
 from mrt_mitsuba.validation.studies.power import changed_bsdf
 
 DIFFUSE = {"type": "diffuse"}
-VEIL = {"type": "mask", "opacity": 0.7, "nested": DIFFUSE}
-GLASS = {"type": "dielectric"}
 MIRROR = {"type": "conductor"}
 GLOSS = {"type": "roughconductor"}
-GLOSSY, DELTA = (+flag for flag in (mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DeltaReflection))
 
 
 @dataclass(frozen=True)
@@ -37,25 +34,8 @@ def without_cosine(value, ctx, wi, wo):
     return value / abs(wo.z)
 
 
-def no_number_at_grazing(value, ctx, wi, wo):
-    return dr.select(wo.z < 1e-3, dr.nan, value)
-
-
 def no_number_in_sharp_lobes(value, ctx, wi, wo):
     return dr.select(value > 1e5, dr.nan, value)
-
-
-def brighter_near_the_horizon(value, ctx, wi, wo):
-    at_wi = 1 + 0.56 * (1 - abs(wi.z)) ** 8
-    at_wo = 1 + 0.56 * (1 - abs(wo.z)) ** 8
-    return 1.8 * value * at_wi * at_wo
-
-
-def in_stairs(value, ctx, wi, wo):
-    if not is_jit():
-        return value
-    step = dr.exp(dr.round(dr.log(value) * 1e5) * 1e-5)
-    return value * dr.detach(dr.select(value > 0, step / value, 0))
 
 
 def steep(value, ctx, wi, wo):
@@ -82,10 +62,6 @@ def by_an_index_that_is_no_number(value, ctx, wi, wo):
     return value * dr.gather(mi.Float, mi.Float(1, 1), index) if is_jit() else value
 
 
-def opaque(value):
-    return 0 * value
-
-
 def detached(value, ctx, wi, wo):
     return dr.detach(value)
 
@@ -104,15 +80,6 @@ def by_switches(value, ctx, wi, wo):
 # --------------------- Changes of samples: of (bs, weight, u, ctx) ---------------------
 
 
-def half_without_weight(bs, weight, u, ctx):
-    return bs, dr.select(bs.wo.x > 0, 0, weight)
-
-
-def unscaled(bs, weight, u, ctx):
-    radiance = ctx.mode == mi.TransportMode.Radiance
-    return bs, weight * bs.eta**2 if radiance else weight
-
-
 def with_the_densitys_derivative(bs, weight, u, ctx):
     return bs, weight * dr.select(bs.pdf > 0, bs.pdf / dr.detach(bs.pdf), 1)
 
@@ -125,14 +92,6 @@ def member(name, change):
         return bs, weight
 
     return apply
-
-
-def inverted(eta):
-    return 1 / eta
-
-
-def nothing(eta):
-    return 0 * eta
 
 
 def too_long(wo):
@@ -152,45 +111,27 @@ def rarely_negative(bs, weight, u, ctx):
     return bs, weight
 
 
-def called_glossy(kind):
-    return kind - DELTA + GLOSSY
-
-
 def following(component):
     return component + 1
 
 
-SINGLE = {"reciprocity.single", "reciprocity.single_modes"}
 OF_VALUES = {
     # then it is no reciprocal value, and what sample() and eval() disagree on shows in the energy as well
     "missing cosine": Mistake(
         "eval", without_cosine, {"weights.weight", "energy.apart", "reciprocity.swapped"}
     ),
-    "NaN at grazing": Mistake("value", no_number_at_grazing, {"finite.values", "finite.million"}),
-    "albedo 1.02 near the horizon": Mistake("value", brighter_near_the_horizon, {"energy.largest"}),
-    "stairs": Mistake("value", in_stairs, {"roundoff.lost"}, GLOSS),
     "cancelling half vector": Mistake("value", cancelling, {"roundoff.lost"}, GLOSS),
     "NaN at the least roughness": Mistake("value", no_number_in_sharp_lobes, {"finite.values"}, GLOSS),
     "index that is no number": Mistake("value", by_an_index_that_is_no_number, {"finite.reads"}),
-    "no light straight through": Mistake(
-        "null", opaque, {"null_transmission.each", "null_transmission.mean"}, VEIL
-    ),
     "detached gradient": Mistake("value", detached, {"gradients.values"}, GLOSS),
     "derivatives that are NaN": Mistake("value", steep, {"gradients.values", "gradients.broken"}, GLOSS),
     # whatever types of lobes are asked for
-    "density through the surface": Mistake(
-        "pdf", across, {"sampling.cells", "sampling.integral", "components.masked_samples"}
-    ),
     "light through the surface": Mistake(
         "eval", across, {"components.values", "components.masked", "sampling.dark"}
     ),
     "another value after each switch": Mistake("value", by_switches, {"switch.same"}),
 }
 OF_SAMPLES = {
-    "weights missing": Mistake("sample", half_without_weight, {"weights.weight", "energy.apart"}),
-    "no eta^2 in single directions": Mistake("sample", unscaled, SINGLE, GLASS),
-    "eta inverted": Mistake("sample", member("eta", inverted), SINGLE, GLASS),
-    "eta of 0": Mistake("sample", member("eta", nothing), {"reciprocity.medium"}, GLOSS),
     "directions not of length 1": Mistake(
         "sample", member("wo", too_long), {"finite.samples", "finite.million"}, MIRROR
     ),
@@ -200,18 +141,6 @@ OF_SAMPLES = {
         "sample",
         member("wo", to_the_other_side),
         {"reciprocity.single", "components.samples"},
-        MIRROR,
-    ),
-    "mirror called glossy": Mistake(
-        "sample",
-        member("sampled_type", called_glossy),
-        {
-            "weights.density",
-            "weights.weight",
-            "energy.apart",
-            "components.samples",
-            "components.masked_samples",
-        },
         MIRROR,
     ),
     "next component": Mistake("sample", member("sampled_component", following), {"components.samples"}),

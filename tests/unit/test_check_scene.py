@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from cases import but_slow
 from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
@@ -156,37 +155,12 @@ def failed(light):
     return {name.split(": ")[1] for name in found.failed if name.startswith("emitter")}
 
 
-LONG = (("sunsky", "llvm_ad_rgb"), ("envmap", "scalar_rgb"), ("envmap", "llvm_ad_spectral"))
-
-
-@pytest.mark.usefixtures("lights_only")
-@pytest.mark.parametrize(
-    ("name", "variant"),
-    [
-        *((name, "llvm_ad_rgb") for name in STOCK if name != "sunsky"),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in LONG),
-    ],
-    indirect=["variant"],
-)
-def test_stock_emitters_and_ours(name, variant):
-    given = {k: mi.Bitmap(v) if k == "bitmap" else v for k, v in STOCK[name].items()}
-    assert not failed({"type": name, **given})
-
-
 def larger(value, *_):
     return 1.01 * value
 
 
 def darker(light):
     return 0.99 * light
-
-
-def denser(pdf, ds):
-    return 1.1 * pdf
-
-
-def stated_denser(ds, u):
-    return put(ds, pdf=1.01 * ds.pdf)
 
 
 def upwards(ds, u):
@@ -206,10 +180,6 @@ def no_number(weight, u, ds):
     return dr.select(u.x > 0.99, dr.nan, weight)
 
 
-def no_number_at_the_end(weight, u, ds):
-    return dr.select(u.x > 1 - 1e-7, dr.nan, weight)
-
-
 def negative(weight, u, ds):
     return -weight
 
@@ -225,19 +195,14 @@ class Mistake:
 
 MISTAKES = {
     "none": Mistake("", larger, set()),
-    "density x 1.01": Mistake("direction", stated_denser, {"density", "weights"}),
-    "pdf_direction x 1.1": Mistake("pdf", denser, {"density", "sampling"}),
-    "weight x 1.01": Mistake("weight", larger, {"weights"}),
     "seen 0.99 times as bright": Mistake("seen", darker, {"weights"}),
-    "eval_direction x 0.99": Mistake("value", darker, {"weights"}),
     "half of the sky": Mistake("direction", upwards, {"sampling"}),
     "wrong distance": Mistake("direction", nearer, {"sampling"}),
     "direction too long": Mistake("direction", too_long, {"sampling", "finite"}),
     "NaN": Mistake("weight", no_number, {"finite"}),
-    "NaN for the last number": Mistake("weight", no_number_at_the_end, {"finite"}),
     "negative": Mistake("weight", negative, {"finite", "weights"}),
 }
-IN_A_SCENE = ("none", "density x 1.01", "half of the sky", "NaN")  # each law is missed by one of them
+IN_A_SCENE = ("none", "seen 0.99 times as bright", "half of the sky", "NaN")  # of three laws
 
 
 @pytest.mark.usefixtures("lights_only")
@@ -355,8 +320,18 @@ EMITTERS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", but_slow(EMITTERS, {"sunsky"}))
-def test_emitters_by_themselves(name, tmp_path):
+LONG = (("sunsky", "llvm_ad_rgb"), ("envmap", "scalar_rgb"), ("envmap", "llvm_ad_spectral"))
+
+
+@pytest.mark.parametrize(
+    ("name", "variant"),
+    [
+        *((name, "llvm_ad_rgb") for name in EMITTERS if name != "sunsky"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in LONG),
+    ],
+    indirect=["variant"],
+)
+def test_emitters_by_themselves(name, variant, tmp_path):
     parameters = dict(EMITTERS[name])
     if name == "envmap":
         parameters["bitmap"] = mi.Bitmap(SUN)
