@@ -32,17 +32,6 @@ if TYPE_CHECKING:
 HERE = Path(__file__).parent
 
 
-# Leaves of a check's page the law of weights, below its bounds that do not hold
-CROP = """() => {
-  for (const row of document.querySelectorAll("table.data tbody tr"))
-    row.hidden = row.cells[0].innerText !== "weights";
-  for (const row of document.querySelectorAll("table.bounds tbody tr"))
-    row.hidden = !(row.matches(".bad, :has(.bad)") && row.innerText.includes("weights"));
-  const tables = document.querySelectorAll("section .wide");
-  tables[0].before(document.querySelector("section .wide:has(.bounds)"));
-}"""
-
-
 def scene3(quick: bool) -> Image.Image:
     """Scene 3 as the command renders it, by default at 800×600."""
     amount = {"aa": 1, "aamode": "none"} if quick else {}
@@ -63,11 +52,10 @@ def check(quick: bool) -> Image.Image:
     ):
         found.save(folder)
         browser = chromium.launch(playwright)
-        page = browser.new_page(viewport={"width": 1180, "height": 700})
+        page = browser.new_page(viewport={"width": 1000, "height": 700})
         page.goto(f"file://{folder}/index.html")
-        page.evaluate(CROP)
-        top = page.locator("section").bounding_box()["y"] + 10
-        shot = page.screenshot(full_page=True, clip={"x": 0, "y": top, "width": 1180, "height": 800})
+        law = page.locator("article", has=page.locator("h3 code", has_text="weights"))
+        shot = law.screenshot()
         browser.close()
     return Image.open(io.BytesIO(shot)).convert("RGB")
 

@@ -93,6 +93,8 @@ class Canvas:
                 if film.reach:
                     begin = max(low + down[0] * film.width, 0)
                     end = min(high + down[-1] * film.width, self.rays.size)
+                    if begin >= end:  # these offsets lead beyond the pictures
+                        continue
                     dr.eval(sums)
                     sums = rays.gathered(sums, low, high, begin, end, down, across)
                 dr.eval(sums)
