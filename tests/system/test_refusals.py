@@ -66,23 +66,16 @@ def misused(words: str, says: str, files: dict[str, Content] | None = None) -> N
 misused("3", "FILENAME is missing")
 misused("doctr", "did you mean mrt doctor")
 misused("exprot --xml a.xml", "mrt export")
-misused("doctor now", "unexpected argument 'now'. usage: mrt doctor")
 misused("help me", "no command 'me': choose one of help, doctor")
 misused("export", "required: --xml")
-misused("export 3", "--xml PATH")
-misused("export 3 --xml", "--xml PATH")
 misused("export --xml a.xml", "SCENE or scene=PATH is missing")
 misused("export 3 scene=a.xml --xml b.xml", "both SCENE 3 and scene=a.xml")
-misused("check", "SCENE or scene=PATH is missing")
 misused("check roughconductor", "a file is scene=PATH")
-misused("check 0 1", "unexpected argument '1'")
 misused("check 0 quick=2", "must be 1 or 0")
 misused("error-vs-time 0", "required: --cases")
 misused("out variant=scalar_rbg", "Did you mean scalar_rgb?")
 misused("sweep out", "required: FILE.toml")
-misused("sweep out no.toml", "cannot read no.toml")
 misused("sweep out no.toml worker=2", "Did you mean workers?")
-misused("check 0 out=a out=b", "out is given twice")
 misused("error-vs-time 0 cases=no.toml", "cannot read no.toml: there is no such file")
 if obstacle("cuda_ad_rgb"):
     refused("out variant=cuda_ad_rgb", "Use llvm_ad_rgb or scalar_rgb")
@@ -95,32 +88,23 @@ refused("none/out", "does not exist; create it first")
 refused("out", "links lead in a circle", {"out.exr": Path("b.exr"), "b.exr": Path("out.exr")})
 refused("out", "out.png: it is not a regular file", {"out.png": PIPE})
 refused("export 8 --xml out.xml", "out_mesh_0.ply: it is a folder", {"out_mesh_0.ply": None})
-refused("export 0 --xml none/a.xml", "does not exist; create it first")
-refused("export 0 --xml a.xml", "a.xml: it is a folder", {"a.xml": None})
-without_uv = textured(WHITE) | {"a.obj": MODEL.replace("/1", "")}
 linked_mtl = textured(WHITE) | {"out.exr": Path("a.mtl")}
-linked_xml = xml("") | {"out.exr": Path("a.xml")}
 linked_scene = xml("") | {"l.xml": Path("a.xml")}
 measured = xml(SPECTRUM) | {"s.spd": "4 1\n7 1\n"}
 refused("p scene=a.obj aa=1", "cannot write p.png: what is written is made from", textured(WHITE))
-refused("p scene=a.obj aa=1", "cannot write p.png", without_uv)
-refused("out scene=a.xml", "out.exr: what is written is made from", linked_xml)
 refused("out scene=a.obj", "out.exr: what is written is made", linked_mtl)
 refused("export scene=l.xml --xml ./a.xml", "a.xml: what is written is", linked_scene)
 refused("export scene=a.obj --xml a.mtl", "a.mtl: what is written is made from this file", textured(WHITE))
 refused("export scene=a.xml --xml s.spd", "s.spd: what is written", measured)
-refused("export scene=no.xml --xml b.xml", "cannot read no.xml: there is no such file")
 misused("export scene=a.xml --xml b.xml --stock", "flavor=stock is of no use with an XML file", xml(""))
 misused("export scene=a.xml --xml b.xml width=3", "width is of no use with an XML file", xml(""))
 
 misused("out width=16384 height=16384 aa=1 memory=512M", "needs 4.1 GiB of memory, and 512 MiB")
-misused("out width=65536 height=65536 aa=1 memory=16G", "choose a smaller width and height")
 misused("out scene=a.xml memory=512M", "a picture of 99999x99999 pixels needs", xml("", LARGE))
 
 # ----------------------------------------------- Files -----------------------------------------------
 
 refused("out scene=a.obj", "cannot read a.obj: there is no such file in")
-refused("out scene=a.xml", "cannot read a.xml: there is no such file in")
 refused("out scene=d.xml", "cannot read d.xml: it is a folder; name a file in it", {"d.xml": None})
 refused("out scene=a.xml", "it is not a regular file; copy its content into one", {"a.xml": PIPE})
 refused("out scene=a.obj", "levels of symbolic links", {"a.obj": Path("a.obj")})
@@ -131,7 +115,6 @@ misused("out scene=a.ply", "a scene file ends in .xml or .obj", {"a.ply": ""})
 
 no_height = SENSOR.format("<integer name='height' value='0'/>")
 no_place = "<sensor type='irradiancemeter'/>"
-refused("out scene=a.xml", "cannot load a.xml", {"a.xml": ""})
 refused("out scene=a.xml", "cannot load a.xml", {"a.xml": b"\xff\xfe\0"})
 refused("out scene=a.xml", "missing version attribute", {"a.xml": f"<scene>{SMALL}</scene>"})
 refused("out scene=a.xml", "a.xml has no sensor: add one", xml("<shape type='sphere'/>", ""))
@@ -145,7 +128,6 @@ misused("out scene=a.xml fresnel=schlick", "it is a parameter of mrt_bsdf", xml(
 
 refused("out scene=a.xml", '- float "aplha"', xml(MISSPELT))
 refused("out scene=a.obj", "p.png', which cannot be read", textured("no picture"))
-refused("out scene=a.obj", "p.png', which cannot be read", textured(b"\x89PNG\r\n\x1a\n\0\0"))
 misused("out scene=a.obj camera=0,9,0 target=0,0,0", "choose another up", {"a.obj": TRIANGLE})
 
 # ------------------------------------------- Tables in TOML ------------------------------------------
@@ -157,7 +139,6 @@ def toml(text: str) -> dict[str, Content]:
 
 misused("error-vs-time 3 cases=a.toml", "no entry 'cases'", toml("reference = {}"))
 misused("error-vs-time 3 cases=a.toml", "unknown entry 'repeat'", toml("repeat = 2\n[cases]\na = {aa = 1}\n"))
-misused("sweep out a.toml workers=x", "must be a whole number", toml(""))
 misused("sweep out a.toml", "cannot read", toml("a ="))
 misused("sweep out a.toml", "grid must be a table", toml("grid = 3"))
 misused("sweep out a.toml", "out cannot be set in a file", toml("out = 'x'"))
@@ -242,7 +223,6 @@ def test_pictures_of_every_kind_are_read(variant, tmp_path):
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 UVS = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
-NORMAL = "vn 0 0 1\n"
 FACE = "f 1 2 3\n"
 MODELS = Cases()
 
@@ -264,24 +244,17 @@ broken_obj(SQUARE + UVS + "f 1/1 2/2 3/5\n", 9, "vt index 5, but the file has 4"
 broken_obj(SQUARE + "f 1/-1 2/-1 3/-1\n", 5, "vt index of 0, or before the first")
 broken_obj(SQUARE + "f 1 2\n", 5, "must have 3 corners or more")
 broken_obj(SQUARE + UVS + "f 1/1 2 3/3\n", 9, "all v, v/vt, v//vn or v/vt/vn")
-broken_obj(SQUARE + "f a b c\n", 5, "'f a b c'")
-broken_obj(SQUARE + "f 1 2 99999999999999999999\n", 5, "9999")
 broken_obj("v 0 0 0\nv 0 1e39 0\n" + SQUARE + "f 1 2 3\n", 2, "too large")
-broken_obj("v 0 0\n" + SQUARE + "f 1 2 3\n", 1, "must have 3 to 7 numbers")
 broken_obj("v 0,5 0 0\n" + SQUARE + "f 1 2 3\n", 1, "but is 'v 0,5 0 0'")
 broken_obj(SQUARE + "vn 0 1\n" + FACE, 5, "vn must have 3 numbers")
 broken_obj("v 0 0 0\n\0\1\2", None, "zero byte")
 broken_obj(SQUARE + "usemtl\n" + FACE, 5, "usemtl has no name")
-broken_obj("mtllib\n" + SQUARE + "f 1 2 3\n", 1, "mtllib has no name")
 
 broken_mtl("Kd 1 1 1\n", 1, "before any newmtl")
-broken_mtl("newmtl\n", 1, "newmtl has no name")
 broken_mtl("newmtl a\nKs 0 -1 0\n", 2, "finite and not negative")
-broken_mtl("newmtl a\nKd 1 1\n", 2, "one or three numbers, finite and not negative, but is '1 1'")
-broken_mtl("newmtl a\nNi\n", 2, "Ni must be one number")
-broken_mtl("newmtl a\nNi glass\n", 2, "'glass'")
 broken_mtl("newmtl a\nKd 1e39 0 0\n", 2, "but is '1e39 0 0'")
-broken_mtl("newmtl a\nKd spectral file.rfl\n", 2, "but is 'spectral file.rfl'")
+broken_mtl("newmtl a\nKd 1 1\n", 2, "one or three numbers, finite and not negative, but is '1 1'")
+broken_mtl("newmtl a\nNi glass\n", 2, "'glass'")
 broken_mtl("newmtl a\nmap_Kd\n", 2, "names no file")
 broken_mtl("newmtl a\n\0", None, "zero byte")
 LIBRARY = "mtllib a.mtl\n" + SQUARE + FACE
@@ -326,9 +299,7 @@ def nothing_but(says: str, **parts: Any) -> None:
 
 wrong("render() got an unexpected keyword argument 'widht'", TypeError, widht=8)
 wrong("there is no scene 99: choose one of 0, 1, 2, 3", scene=99)
-wrong("there is no scene -1: choose one of 0, 1, 2, 3", scene=-1)
 wrong("scene is 1.5: give a number, a Scene, a dict, a Mitsuba scene or a path", scene=1.5)
-wrong("scene is None: give a number", scene=None)
 wrong("edges", aamode="none", layers=["edges"])
 wrong("the integrator is 3: it must be one, such as path", integrator=3)
 wrong("ParticleTracerIntegrator gives whole pictures", integrator="ptracer", aamode="sobel")
@@ -339,7 +310,6 @@ no_scene("a\0b.xml", "embedded null")
 no_scene({"type": "scene"}, "a dict has no sensor: add one")
 no_scene({"type": "potato"}, 'Plugin "potato" not found')
 no_scene({"type": "sphere"}, "a dict is a Shape, not a scene: put it into one")
-no_scene({"type": 3}, "type is 3; give the name of a plugin")
 nowhere = {"type": "sphere", "center": None}
 no_scene({"type": "scene", "ball": nowhere}, "ball.center is None; give it a")
 no_scene({"type": "mrt_bsdf", "alpha": "big"}, "mrt_bsdf: \"alpha\" is 'big', but must be a number")
@@ -349,7 +319,6 @@ nothing_but("texturing is 'nice', but must be report or standard", texturing="ni
 nothing_but("are the same point", camera=Camera((1, 1, 1), (1, 1, 1)))
 nothing_but("position is (0, nan, 0)", camera=Camera((0, NAN, 0), (0, 0, 0)))
 nothing_but("less than 180 degrees", camera=replace(EMPTY.camera, hfov=180))
-nothing_but("hfov is 'wide'", camera=replace(EMPTY.camera, hfov="wide"))
 nothing_but("spheres[1] is Sphere(", spheres=(BALL, replace(BALL, radius=0)))
 endless = Cone((0, 0, INFINITE), (0, 0, 0), 1, MATTE)
 flat = Cylinder((0, 0, 0), (0, 0, 0), 1, MATTE)
@@ -427,22 +396,17 @@ def balls(says: str, **parameters: Any) -> None:
 
 spoilt("mrt_adaptive", "give one integrator inside")
 adaptive('"tarqet" is none of its parameters', tarqet=1.0)
-adaptive('"target" is 0.0, but must be a number > 0', target=0.0)
 adaptive('give "target" or "spp", not both', target=0.1, spp=64)
 spoilt("mrt_bsdf", '"alpha" is nan, but must be a finite number', alpha=NAN)
 spoilt("mrt_bsdf", '"alpha" is True, but must be a number', alpha=True)
 spoilt("mrt_bsdf", '"int_ior" is 0.0, but must be a finite number > 0', int_ior=0.0)
-spoilt("mrt_bsdf", "is 'red', but must be a number, a colour", diffuse_reflectance="red")
 spoilt("mrt_bsdf", "not negative", specular_reflectance=NO_COLOUR)
 spoilt("mrt_bsdf", "one of schlick, dielectric, unity", fresnel={"type": "rgb", "value": 1})
 spoilt("mrt_bsdf", '"f0" has no meaning with fresnel="unity"', f0=0.1, fresnel="unity")
 spoilt("mrt_bsdf", '"sample_visible" is 1, but must be true or false', sample_visible=1)
-spoilt("mrt_bsdf", '"aplha"', aplha=0.1)
 spoilt("mrt_light", '"position" is', position=[0, NAN, 0])
-spoilt("mrt_light", '"to_world"', to_world=1.0)
 spoilt("mrt_plane", '"normal" is missing; give three numbers')
 plane('"normal" is [0, 0, 0], but must be a vector of non-zero length', normal=[0, 0, 0])
-plane('"extent" is 0.0, but must be a finite number > 0', extent=0.0)
 plane('mrt_plane: "to_world" is not accepted', to_world=2.0)
 spoilt("mrt_whitted", '"sky" is -1.0, but must be finite and not negative', sky=-1.0)
 spoilt("mrt_whitted", "but must be an integer from 1 to 4294967295", max_depth=2**32)
@@ -450,7 +414,6 @@ spoilt("mrt_texture", "give one of")
 spoilt("mrt_texture", "nothing.png", filename="nothing.png")
 spoilt("mrt_texture", '"bitmap" is 3, but must be a mi.Bitmap', bitmap=3)
 spoilt("mrt_cone", '"apex" is missing')
-cone('"radius" is -1', radius=-1.0)
 cone('"segments" is 2, but must be an integer from 3 to 65536', segments=2)
 cone("two points", apex=[0, 0, 0])
 cone("true or false", capped=1)

@@ -136,17 +136,6 @@ def test_samples_counts_the_rays_of_each_pixel(options):
     assert result.layers["samples.Y"].sum() == result.rays["primary"]
 
 
-def test_adaptive_sampling_works_over_a_stock_integrator():
-    scene = mi.load_dict(mrt.scene_dict(0, width=64, height=48, flavor="stock"))
-    result = mrt.render(scene, integrator="path", spp=8, aa=2, aamode="sobel", layers=["albedo", "normal"])
-    refined = (result.layers["samples.Y"] > 8).sum()
-    assert 0 < refined < 64 * 48
-    assert result.layers["samples.Y"].sum() == result.rays["primary"] - 64 * 48
-    # the layers come from one ray through the centre of each pixel
-    assert result.rays["primary"] == 64 * 48 + 8 * (64 * 48 + 3 * refined)
-    assert np.isfinite(result.image).all()
-
-
 @pytest.mark.parametrize("other_variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
 def test_other_variants_show_the_same_scene(other_variant):
     """Spectral rendering upsamples colours and draws wavelengths: luminance agrees to a few percent."""

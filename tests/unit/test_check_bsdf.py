@@ -257,43 +257,22 @@ def test_the_smallest_p_value_is_corrected_for_all_tests(monkeypatch):
     assert f"at {angles} angles" in cells.name
 
 
-LAMBERT = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-
-
 def read_nearest(entries, place):
-    """A class of diffuse BSDFs with a table that is read by the nearest entry, at a place in [0, 1)."""
+    """A change of values by a table that is read by the nearest entry, at a place in [0, 1)."""
 
-    class Table(mi.BSDF):
-        def __init__(self, props):
-            mi.BSDF.__init__(self, props)
-            self.m_flags = LAMBERT
-            self.m_components = [self.m_flags]
-            self.table = mi.Float(np.linspace(0.2, 0.8, entries, dtype=np.float32))
+    def change(value, ctx, wi, wo):
+        index = dr.clip(dr.floor(place(wi, wo) * entries), 0, entries - 1)
+        return value * (0.4 + 0.6 * index / entries)
 
-        def eval(self, ctx, si, wo, active=True):
-            lit = active & (si.wi.z > 0) & (wo.z > 0)
-            index = mi.UInt32(dr.clip(place(si.wi, wo) * entries, 0, entries - 1))
-            return mi.Spectrum(dr.select(lit, dr.gather(mi.Float, self.table, index, lit) * wo.z / dr.pi, 0))
-
-        def pdf(self, ctx, si, wo, active=True):
-            return dr.select(active & (si.wi.z > 0) & (wo.z > 0), wo.z / dr.pi, 0)
-
-        def sample(self, ctx, si, sample1, sample2, active=True):
-            bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
-            bs.pdf = self.pdf(ctx, si, bs.wo, active)
-            bs.eta = 1
-            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
-            return bs, dr.select(bs.pdf > 0, self.eval(ctx, si, bs.wo, active) / bs.pdf, 0)
-
-    return Table
+    return change
 
 
 @pytest.mark.parametrize("entries", [16, 256, 1024])
 @pytest.mark.parametrize("place", [lambda wi, wo: wi.z, lambda wi, wo: wi.z * wo.z], ids=["wi", "both"])
 def test_a_step_of_a_table_is_no_rounding_error(entries, place):
-    mi.register_bsdf("table", read_nearest(entries, place))
-    holds(mrt.check_bsdf({"type": "table"}, quick=True, only=["roundoff"]))
+    mi.register_bsdf("table", power.changed_bsdf({"": ("value", read_nearest(entries, place))}))
+    given = {"type": "table", "change": "", "nested": {"type": "diffuse"}}
+    holds(mrt.check_bsdf(given, quick=True, only=["roundoff"]))
 
 
 def without_active(self, ctx, si, wo):

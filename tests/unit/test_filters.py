@@ -311,7 +311,7 @@ def test_contours_stand_side_by_side_in_white_on_black(tmp_path):
 
 IMAGE = np.zeros((4, 5, 3))
 DEPTH = np.zeros((4, 5))
-SHAPES = [(), (4,), (4, 5), (4, 5, 4), (4, 5, 1), (3, 4, 5, 3), (0, 5, 3), (5, 0, 3)]
+SHAPES = [(), (4, 5), (4, 5, 4), (3, 4, 5, 3), (0, 5, 3)]
 
 
 wrong = Cases()
@@ -321,15 +321,12 @@ for find in DETECTORS:
 wrong(partial(luma_edges, IMAGE, variance=IMAGE[:, 1:]), r"variance has shape \(4, 4, 3\); expected \[4")
 wrong(partial(sobel_edges, IMAGE, variance=IMAGE, noise_sigmas=-1), "noise_sigmas=-1")
 wrong(partial(sobel_edges, IMAGE, threshold=np.nan), "threshold is not a number")
-wrong(partial(luma_edges, IMAGE, relative_threshold=np.nan), "relative_threshold is not a number")
 wrong(partial(geometry_edges, IMAGE, DEPTH[:2]), "depth has shape")
 wrong(partial(geometry_edges, IMAGE, DEPTH, crease_angle=0), "crease_angle=0")
-wrong(partial(geometry_edges, IMAGE, DEPTH, depth_step=0), "depth_step=0")
 wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, mode="lens"), "use one of report, cor")
 wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=np.nan), "focal_distance is not a number")
 wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, focal_range=np.nan), "focal_range is not a")
 wrong(partial(gaussian_dof, IMAGE, DEPTH.T, focal_distance=1), r"shape \(5, 4\); expected \[4, 5\]")
-wrong(partial(gaussian_dof, DEPTH, DEPTH, focal_distance=1), "image has shape")
 wrong(filters.contours, r"at least one; given: \[\]")
 wrong(lambda: filters.contours(sobel_edges(IMAGE), sobel_edges(IMAGE[1:])), r"one height.*\[3, 4\]")
 

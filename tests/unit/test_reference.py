@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from PIL import Image
 
 from mrt_mitsuba import SceneError
 from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
-from mrt_mitsuba.validation.oracles.reference import nearest, reference_render, unit
+from mrt_mitsuba.validation.oracles.reference import reference_render
 
 WOOD = Material(1.5, 0.3, (0.5, 0.4, 0.3), (0.2, 0.3, 0.4))
 # A camera on the x axis, with one pixel: its ray runs along -x
@@ -67,60 +66,8 @@ def test_a_surface_is_lit_on_its_outer_side_alone():
     assert (pixel(before) > 0).all()
 
 
-CONE = Cone((0, 1, 0), (0, 0, 0), 0.5, WOOD)
-TUBE = Cylinder((0, -1, 0), (0, 2, 0), 0.5, WOOD)
 CORNERS = np.array([(0, -1, -1), (0, -1, 3), (0, 3, -1)], float)
 TRIANGLE = Mesh(CORNERS, np.array([[0, 2, 1]]), WOOD)
-NEAR = Sphere((0.5, 0, 0), 0.5, WOOD)
-FAR = Sphere((-2, 0, 0), 0.5, WOOD)
-
-
-@dataclass(frozen=True)
-class Ray:
-    """A camera's ray."""
-
-    position: tuple[float, ...]
-    target: tuple[float, ...]
-
-
-OUTWARDS = (2 / 5**0.5, 1 / 5**0.5, 0)  # off the cone's side, whose slope is 1 over 0.5
-LARGE = Sphere((0, 0, 0), 9, WOOD)
-WALL = Plane((2, 0, 0), 5, WOOD)
-meetings = Cases()
-
-
-def meets(ray: Ray, depth: float, normal: tuple[float, ...], *things: Any, which: int = 0) -> None:
-    """Add things, how far along a ray one is met, its normal there, and which it is."""
-    meetings(ray, things, depth, normal, which)
-
-
-def passes(ray: Ray, *things: Any) -> None:
-    meets(ray, np.inf, (0, 0, 0), *things, which=-1)
-
-
-meets(Ray((3, 0, 0), (0, 0, 0)), 2, (1, 0, 0), NEAR, FAR)
-meets(Ray((3, 0, 0), (0, 0, 0)), 2, (1, 0, 0), FAR, NEAR, which=1)
-meets(Ray((3, 0, 0), (0, 0, 0)), 12, (-1, 0, 0), LARGE)
-meets(Ray((3, 4, 0), (0, 4, 0)), 8, (1, 0, 0), WALL, TUBE)
-meets(Ray((0.1, -3, 0), (0.1, 0, 0)), 3, (0, -1, 0), CONE)
-meets(Ray((3, 0.2, 0), (0, 0.2, 0)), 3 - 0.4, OUTWARDS, CONE)
-meets(Ray((0.3, 3, 0), (0.3, 0, 0)), 2.6, OUTWARDS, CONE)  # no disc at the apex
-passes(Ray((3, 1.2, 0), (0, 1.2, 0)), CONE)
-meets(Ray((3, 0, 0), (0, 0, 0)), 2.5, (1, 0, 0), TUBE)
-meets(Ray((0.2, 5, 0), (0.2, 0, 0)), 3, (0, 1, 0), TUBE)
-meets(Ray((0.2, -5, 0), (0.2, 0, 0)), 4, (0, -1, 0), TUBE)
-passes(Ray((0.6, 5, 0), (0.6, 0, 0)), TUBE)
-meets(Ray((3, 0.9, 0.9), (0, 0.9, 0.9)), 3, (1, 0, 0), TRIANGLE)
-passes(Ray((3, 1.1, 1), (0, 1.1, 1)), TRIANGLE)
-
-
-@pytest.mark.parametrize(("ray", "things", "depth", "normal", "index"), meetings)
-def test_a_ray_meets_the_nearest_thing(ray, things, depth, normal, index):
-    o = np.array([ray.position], float)
-    t, thing, n, _ = nearest(things, o, unit(ray.target - o))
-    assert t[0] == pytest.approx(depth, abs=1e-13)
-    assert thing[0] == index
-    assert_allclose(n[0], normal, atol=1e-13, rtol=0)
 
 
 def test_triangles_show_the_nearest_texel(tmp_path):

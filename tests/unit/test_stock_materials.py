@@ -30,9 +30,7 @@ textured = Cases()
 textured({"type": "diffuse", "reflectance": CHECKERS})
 textured({"type": "twosided", "inner": {"type": "diffuse", "reflectance": CHECKERS}})
 textured({"type": "roughplastic", "diffuse_reflectance": CHECKERS})
-textured({"type": "principled", "base_color": CHECKERS})
 textured({"type": "blendbsdf", "weight": CHECKERS, "a": {"type": "diffuse"}, "b": {"type": "plastic"}})
-textured({"type": "roughconductor", "alpha": CHECKERS})
 
 
 @pytest.mark.parametrize(
