@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,10 @@ class Law:
     judge: Callable[..., None]  # of an ``Outcome`` and a case
     criteria: Mapping[str, Criterion]
     faults: tuple[Fault, ...] = ()
+
+    def __reduce__(self) -> tuple[Callable[[str], Any], tuple[str]]:
+        """Pickle a law by its name: its function has the same one."""
+        return resolve_name, (f"{self.judge.__module__}:{self.name}",)
 
     @property
     def name(self) -> str:
