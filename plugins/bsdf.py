@@ -132,7 +132,9 @@ class MrtBSDF(mi.BSDF):
         if dr.grad_enabled(given):
             return GRADIENTS
         row = np.zeros((2 + len(LOBES), 4))
-        from_iors = mi.UnpolarizedSpectrum(f0_from_ior(given["ext_ior"], given["int_ior"]))
+        iors = (np.float32(first(given[name][0])) for name in ("ext_ior", "int_ior"))
+        f0 = float(f0_from_ior(*iors))  # on the host: no kernel for each material
+        from_iors = [f0] * len(given[LOBES[0].reflectance])
         colors = [given[lobe.reflectance] for lobe in LOBES] + [given.get("f0", from_iors)]
         parts = [given[name] for name in NUMBERS], *colors
         for k, part in enumerate(parts):

@@ -58,7 +58,7 @@ def replacing(*paths: StrPath, inputs: Iterable[StrPath] = ()) -> Iterator[list[
                 file.flush()
                 os.fsync(file.fileno())
                 if os.path.exists(target):
-                    os.fchmod(file.fileno(), stat.S_IMODE(os.stat(target).st_mode))
+                    os.chmod(file.name, stat.S_IMODE(os.stat(target).st_mode))
             with defer_signals():  # an interrupt in between is raised afterwards
                 for file, target in zip(files, targets, strict=True):
                     os.replace(file.name, target)

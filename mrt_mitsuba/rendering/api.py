@@ -253,6 +253,7 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
         layers = picture.layers
         error = picture.error
         job.collect()
+        job.progress.finish()
         text = "%d kernels: compiled in %.3f s, ran for %.3f s"
         log.info(text, job.launches, timings.compile, timings.kernels)
         return Result(

@@ -42,6 +42,9 @@ class Progress:
     def round(self, picture: RoundPicture) -> None:
         """Receive the picture after a round of rays."""
 
+    def finish(self) -> None:
+        """Receive the end of the render."""
+
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
         """Open a stage of ``total`` steps, and give a function to call with the number of steps just done.
@@ -105,6 +108,7 @@ class NotebookProgress(TerminalProgress):
 
     _display: Any = None  # IPython's handle of the picture
     _picture = ""  # after the last round, as HTML
+    _caption = ""
 
     def round(self, picture: RoundPicture) -> None:
         from mrt_mitsuba.files.images import png
@@ -113,7 +117,14 @@ class NotebookProgress(TerminalProgress):
         target = "" if picture.target is None else f" (target {picture.target:.2g})"
         caption = f"error {picture.rmse:.2g}{target}, {picture.spp:.0f} rays a pixel, {picture.seconds:.1f} s"
         self._picture = f'<img src="data:image/png;base64,{encoded}" alt="{caption}">'
+        self._caption = caption
         self._show(caption)
+
+    def finish(self) -> None:
+        """Leave a line: the result shows the picture itself."""
+        if self._display is not None:
+            self._picture = ""
+            self._show(self._caption)
 
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
@@ -127,7 +138,7 @@ class NotebookProgress(TerminalProgress):
     def _show(self, caption: str) -> None:
         from IPython.display import HTML, display
 
-        shown = HTML(f"{self._picture}<br>{caption}")
+        shown = HTML(f"{self._picture}<br>{caption}" if self._picture else caption)
         if self._display is None:
             self._display = display(shown, display_id=True)
         else:

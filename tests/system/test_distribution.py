@@ -29,8 +29,9 @@ NOT_SOURCE = shutil.ignore_patterns(
 
 
 def run(*command: str | Path, cwd: Path) -> str:
-    """Output of a command that must succeed; the LLVM of the tests is not lent to it."""
+    """Output of a command that must succeed, without the LLVM of the tests, make, git or a compiler."""
     environ = {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
+    environ["PATH"] = str(Path(sys.executable).parent)
     done = subprocess.run(
         command, cwd=cwd, env=environ, capture_output=True, text=True, timeout=600, check=False
     )
@@ -106,3 +107,9 @@ def test_installed_command_renders(installed, tmp_path):
     run(installed / "mrt", "demo", "7", "width=32", "height=24", "aa=1", cwd=tmp_path)
     run(installed / "mrt", "export", "0", "--xml", "a.xml", cwd=tmp_path)
     run(installed / "mrt", "mine", "scene=a.xml", "aa=1", cwd=tmp_path)
+
+
+def test_installed_package_compares_with_roughconductor(installed, tmp_path):
+    """What the package is used for first needs no extra; its p-value alone does."""
+    code = "import mrt_mitsuba as mrt; found = mrt.compare_roughconductor(size=32, renders=4); print(found)"
+    assert run(installed / "python", "-c", code, cwd=tmp_path)

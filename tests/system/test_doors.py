@@ -129,6 +129,7 @@ def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):
     assert isinstance(progress, NotebookProgress)
     progress.bar_file = io.StringIO()
     result = mrt.render(box(), integrator="path", spp=64, aamode="noise", progress=progress)
+    assert shown.pop().startswith(f"error {result.rounds[-1].rmse:.2g}")
     after = shown[::2]  # between them, what the next round adds
     assert len(after) == len(result.rounds)
     assert all(re.search(r"rays a pixel, now \d+ more$", html) for html in shown[1::2])

@@ -422,7 +422,7 @@ except BaseException as error:
 """
 
 
-@pytest.mark.parametrize("nested", ["path", "ptracer"])
+@pytest.mark.parametrize("nested", ["path"])
 @pytest.mark.parametrize("delay", [0.3, 2.0])
 def test_ctrl_c_during_mrt_adaptive_is_a_keyboard_interrupt(run_python, nested, delay):
     lines = run_python(INTERRUPT, nested, str(delay)).stdout.splitlines()

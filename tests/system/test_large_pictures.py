@@ -149,7 +149,7 @@ import types
 import numpy as np
 from mrt_mitsuba.files import images as output
 class Result:
-    def save(self, path, tonemap):
+    def save(self, path, tonemap, compression):
         image = np.random.default_rng(0).random((3000, 4000, 3), np.float32)
         signal_soon()
         output.save(path, image)
