@@ -190,8 +190,8 @@ def test_errors_end_at_their_target_against_the_best_sampler(monkeypatch):
     found = findings(adaptive.against_the_best, size=48, rays=64, turns=1, seeds=2)
     assert found.passed, found.missed
     rows = found.tables["best-48"]["rows"]
-    assert [row[:2] for row in rows] == [["texture", "linear"], ["texture", "display"]]
-    assert rows[0][2] in adaptive.SAMPLERS
+    assert [row[:3] for row in rows] == [["texture", *goal] for goal in adaptive.GOALS]
+    assert rows[0][3] in adaptive.SAMPLERS
 
 
 @pytest.mark.parametrize("aim", [1.0, 1.3])
@@ -215,7 +215,7 @@ def test_costs_are_those_of_the_best_sampler_to_its_own_error(monkeypatch, aim):
     monkeypatch.setattr(adaptive, "adaptive", ours)
     monkeypatch.setattr(adaptive, "timed_in_turns", timed_in_turns)
     others = [([picture(0.1)] * 2, np.full(2, 8.0)), ([picture(0.02)] * 2, np.full(2, 64.0))]
-    row = adaptive.to_an_error(None, true, "linear", others, turns=2, seeds=6)
+    row = adaptive.to_an_error(None, true, {"metric": "linear"}, others, turns=2, seeds=6)
     assert row["sampler"] == adaptive.SAMPLERS[1]  # a 25th of the squared error for 8 times the time
     assert row["time"] == 0.5
     assert_allclose([row["target"], row["error"]], [0.02, aim], rtol=0.03)
