@@ -7,7 +7,6 @@ import fcntl
 import io
 import os
 import pickle
-import resource
 import signal
 import time
 from collections.abc import Iterator
@@ -158,24 +157,6 @@ def old(folder: Path, endings: list[str]) -> list[Path]:
     for path in paths:
         path.write_bytes(b"old")
     return paths
-
-
-@pytest.mark.parametrize(
-    ("endings", "room"),
-    [(["exr"], 0), (["exr"], 2000), (["png", "exr"], 6000)],  # the last is enough for one
-)
-def test_full_disk_leaves_the_old_files(tmp_path, endings, room):
-    paths = old(tmp_path, endings)
-    noise = np.random.default_rng(0).random((40, 40, 3), np.float32)  # does not compress
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
-    try:
-        with pytest.raises(OutputError, match="File too large"):
-            output.save(paths, noise)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert [path.read_bytes() for path in paths] == [b"old"] * len(paths)
-    assert sorted(tmp_path.iterdir()) == sorted(paths)
 
 
 @pytest.fixture

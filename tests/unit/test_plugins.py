@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 
 from mrt_mitsuba import plugins
 from mrt_mitsuba.plugins.lobes import LOBES, Lobes, Pair
-from mrt_mitsuba.plugins.table import PLUGINS, Plugin, names_in
+from mrt_mitsuba.plugins.table import PLUGINS, Plugin
 from mrt_mitsuba.plugins.whitted import facts
 from mrt_mitsuba.plugins.whitted.materials import material_rows
 from mrt_mitsuba.plugins.whitted.snapshot import Cache, Snapshot
@@ -161,13 +161,6 @@ def test_a_number_that_is_set_needs_no_new_kernel(row):
         kernels = dr.kernel_history([dr.KernelType.JIT])  # of the last value and picture
         assert kernels
         assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)
-
-
-def test_reasons_name_the_plugins_of_the_table():
-    assert names_in("materials") == "mrt_bsdf"
-    assert "mrt_light" in names_in("lights").split(", ")
-    rows = material_rows([mi.load_dict({"type": "sphere"})])
-    assert rows == ([], "a material other than mrt_bsdf")
 
 
 def test_lobes_may_share_a_flag(monkeypatch):

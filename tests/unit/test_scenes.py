@@ -14,15 +14,9 @@ from mrt_mitsuba.errors import MrtError, MrtWarning, SceneError
 from mrt_mitsuba.scene.export import write_xml
 from mrt_mitsuba.scene.model import Camera, Material, Scene, Sphere
 from mrt_mitsuba.scene.open import open_scene
-from mrt_mitsuba.scene.report import NUMBERS, report_scene
+from mrt_mitsuba.scene.report import report_scene
 
 SIZE = {"width": 96, "height": 72, "aa": 1}
-
-
-def test_there_are_ten_scenes_each_read_once():
-    assert tuple(range(10)) == NUMBERS
-    assert len({report_scene(number).title for number in NUMBERS}) == 10
-    assert report_scene(3) is report_scene(3)
 
 
 @pytest.mark.parametrize("number", range(10))
