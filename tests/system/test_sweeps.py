@@ -472,9 +472,11 @@ mi.register_bsdf("grey", Grey)
 
 
 class Listening(Progress):
-    """Notes the addresses at which this process and its descendants listen while a sweep runs."""
+    """Notes the addresses at which this process and its descendants listen while a sweep runs, and did not
+    before it, as clusters of other tests do."""
 
     def __init__(self) -> None:
+        self.before = set(self.listeners())
         self.addresses: set[str] = set()
 
     @contextlib.contextmanager
@@ -482,6 +484,11 @@ class Listening(Progress):
         yield self.note
 
     def note(self, steps: int) -> None:
+        found = self.listeners()
+        self.addresses |= {found[socket] for socket in found.keys() - self.before}
+
+    def listeners(self) -> dict[str, str]:
+        """Addresses by socket."""
         import psutil
 
         own = psutil.Process()
@@ -491,11 +498,14 @@ class Listening(Progress):
             for link in Path(f"/proc/{process.pid}/fd").iterdir()
             if os.path.islink(link)
         }
+        found = {}
         for table in ("tcp", "tcp6"):
             for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
                 words = line.split()
-                if words[3] == "0A" and f"socket:[{words[9]}]" in sockets:
-                    self.addresses.add(words[1].split(":")[0])
+                socket = f"socket:[{words[9]}]"
+                if words[3] == "0A" and socket in sockets:
+                    found[socket] = words[1].split(":")[0]
+        return found
 
 
 def test_a_sweep_of_this_machine_is_closed_to_others(tmp_path, monkeypatch):
