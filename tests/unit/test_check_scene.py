@@ -180,6 +180,10 @@ def no_number(weight, u, ds):
     return dr.select(u.x > 0.99, dr.nan, weight)
 
 
+def nowhere_a_number(light):
+    return dr.nan * light
+
+
 def negative(weight, u, ds):
     return -weight
 
@@ -201,6 +205,7 @@ MISTAKES = {
     "direction too long": Mistake("direction", too_long, {"sampling", "finite"}),
     "NaN": Mistake("weight", no_number, {"finite"}),
     "negative": Mistake("weight", negative, {"finite", "weights"}),
+    "NaN where it is seen": Mistake("seen", nowhere_a_number, {"finite"}),
 }
 IN_A_SCENE = ("none", "seen 0.99 times as bright", "half of the sky", "NaN")  # of three laws
 
@@ -258,6 +263,15 @@ def seen_from_behind(self, si, active=True):
     return mi.Spectrum(3)
 
 
+def infinite_at_grazing_angles(self, si, active=True):
+    bright = dr.select(si.wi.z < 0.02, dr.inf, 3)
+    return mi.Spectrum(dr.select(si.wi.z > 0, bright, 0))
+
+
+def nothing(self, it, ds, active=True):
+    return None
+
+
 def without_active(self, it, ds):
     return mi.Spectrum(3)
 
@@ -276,11 +290,13 @@ LAMPS: dict[str, tuple[dict[str, Any], set[str]]] = {
     "seen from behind": ({"eval": seen_from_behind}, {"weights.seen"}),
     "half of the density": ({"denser": 0.5}, {"sampling.light"}),
     "1.2 times the density": ({"denser": 1.2}, {"sampling.light"}),
+    "infinite at grazing angles": ({"eval": infinite_at_grazing_angles}, {"finite.seen"}),
 }
 BROKEN = {
     "eval_direction": (without_active, "takes 3 positional arguments but 4 were given"),
     "eval": (a_pair, "eval() returned Color3f, float: it must return Spectrum"),
     "sample_direction": (raising, "RuntimeError: no direction"),
+    "pdf_direction": (nothing, "pdf_direction() returned NoneType: it must return Float"),
 }
 
 
@@ -375,6 +391,7 @@ def test_each_figure_of_an_emitter_has_a_specimen():
         "weights.seen",
         "finite.bad",
         "finite.reads",
+        "finite.seen",
         "sampling.light",
     }  # of ``MISTAKES``
     assert known == {f"{n}.{figure}" for n, law in emitters.LAWS.items() for figure in law.criteria}

@@ -185,7 +185,7 @@ def test_shapes_that_are_otherwise_elsewhere(figure, monkeypatch):
 def test_each_figure_has_a_specimen():
     known = set().union(*(mistake.figures for mistake in MISTAKES.values()))
     known |= {f"{fault.law}.{fault.criterion}" for fault in power.KINDS["shape"].faults}
-    known.update(ELSEWHERE, {"scale.box"})
+    known.update(ELSEWHERE, {"scale.box", "scale.moved"})
     assert known == {f"{name}.{figure}" for name, law in LAWS.items() for figure in law.criteria}
 
 
@@ -205,22 +205,48 @@ def filled(made, vertices, faces):
     return made
 
 
-@pytest.mark.parametrize("scaled", [0.0, 1.0], ids=["not at all", "along one axis"])
-def test_a_shape_that_ignores_to_world_fails(scaled):
+def not_scaled(matrix):
+    return np.eye(4)
+
+
+def scaled_along_x(matrix):
+    return np.diag([matrix[0, 0], 1, 1, 1])
+
+
+def not_moved(matrix):
+    return np.column_stack([matrix[:, :3], [0, 0, 0, 1]])
+
+
+def not_turned(matrix):
+    turned = matrix.copy()
+    turned[:3, :3] = np.diag(np.linalg.norm(matrix[:3, :3], axis=0))
+    return turned
+
+
+@pytest.mark.parametrize(
+    ("change", "figure"),
+    [
+        (not_scaled, "scale.box"),
+        (scaled_along_x, "scale.box"),
+        (not_moved, "scale.moved"),
+        (not_turned, "scale.moved"),
+    ],
+)
+def test_a_shape_that_ignores_to_world_fails(change, figure):
     cube = mi.traverse(mi.load_dict({"type": "cube"}))
 
     class Deaf(mi.Mesh):
         def __init__(self, props):
-            matrix = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix)
-            vertices = np.array(cube["vertex_positions"]).reshape(-1, 3)
-            vertices[:, 0] *= matrix[0, 0] ** scaled
+            matrix = change(np.array(props.get("to_world", mi.ScalarTransform4f()).matrix))
+            vertices = np.array(cube["vertex_positions"]).reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
             mi.Mesh.__init__(self, "deaf", len(vertices), len(cube["faces"]) // 3, props)
             filled(self, vertices.ravel(), np.array(cube["faces"]))
 
     mi.register_shape("deaf", Deaf)
     found = mrt.check_shape({"type": "deaf"}, quick=True, only=["scale", "hits"])
     assert found.failed == ["scale"], str(found)
-    assert "scale.box" in exceeded(found)
+    assert figure in exceeded(found)
+    assert "turned and moved" in found.laws["scale"].output or figure == "scale.box"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,6 +59,35 @@ def test_the_error_is_lower_and_known(truth, deviation, filtered, left):
         held += found.low <= error <= found.high
     assert left[0] <= np.mean(saved) <= left[1]
     assert held >= COUNT - 4
+
+
+def test_the_error_of_a_known_denoiser(monkeypatch):
+    """One that takes away half of the noise: it is taken whole, and its mean has half of the error."""
+
+    def halved(color, *features):
+        return ((color + SMOOTH) / 2).astype(np.float32)
+
+    monkeypatch.setattr(sys.modules["mrt_mitsuba.filters.denoise"], "_open_image_denoise", halved)
+    found = filters.denoise(noisy(SMOOTH, 0, 0.02), noisy(SMOOTH, 1, 0.02))
+    assert found.weight.min() > 0.99
+    assert found.rmse == pytest.approx(rms(found.image - SMOOTH), rel=0.03)
+    assert found.rmse == pytest.approx(rms(found.noisy - SMOOTH) / 2, rel=0.03)
+
+
+def test_what_the_library_is_given(monkeypatch):
+    """Colors of 0 or more, albedo in [0, 1], normals in [-1, 1], and all of them finite."""
+    given = {}
+
+    def denoise(color, **features):
+        given.update(features, color=color)
+        return color
+
+    monkeypatch.setitem(sys.modules, "pyoidn", SimpleNamespace(denoise=denoise))
+    pixel = np.float32([[[-2, np.nan, 0.5]]])
+    filters.denoise(np.nan_to_num(pixel), np.nan_to_num(pixel), albedo=pixel, normal=pixel)
+    assert_array_equal(given["color"], [[[0, 0, 0.5]]])
+    assert_array_equal(given["albedo"], [[[0, 0, 0.5]]])
+    assert_array_equal(given["normal"], [[[-1, 0, 0.5]]])
 
 
 def test_errors_of_pixels_are_calibrated():

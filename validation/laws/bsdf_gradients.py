@@ -168,8 +168,8 @@ def _sampled(law: Outcome, case: BsdfCase, key: str) -> None:
         si = probe.interaction(as_mitsuba("Vector3f", at.wi), as_mitsuba("Point2f", at.uv))
         sample1 = as_mitsuba("Float", at.u[:, 0])
         sample2 = as_mitsuba("Point2f", at.u[:, 1:])
-        bs, weight = case.plugin.sample(context(), si, sample1, sample2)
-        value, pdf = case.plugin.eval_pdf(context(), si, dr.detach(bs.wo))
+        bs, weight = probe.method(case.plugin, "sample")(context(), si, sample1, sample2)
+        value, pdf = probe.method(case.plugin, "eval_pdf")(context(), si, dr.detach(bs.wo))
         light = 1 + 0.5 * bs.wo.x + 0.25 * dr.square(bs.wo.z)
         fixed = dr.detach(dr.select(pdf > 0, pdf, 1))
         by_value = _total(value) / fixed
@@ -232,7 +232,7 @@ def _values(case: BsdfCase) -> mi.Float:
     wo = as_mitsuba("Vector3f", few.wo)
     si = probe.interaction(as_mitsuba("Vector3f", few.wi), as_mitsuba("Point2f", few.uv))
     scale = np.maximum(few.value.max(axis=1), 1e-3 * few.value.max())
-    return _total(case.plugin.eval(context(), si, wo)) / as_mitsuba("Float", scale)
+    return _total(probe.method(case.plugin, "eval")(context(), si, wo)) / as_mitsuba("Float", scale)
 
 
 def _differences(case: BsdfCase, key: str) -> tuple[Array, Array]:

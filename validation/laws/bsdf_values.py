@@ -75,8 +75,8 @@ def eval_pdf(law: Outcome, case: BsdfCase) -> None:
 
     def switched_off(ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> list[mi.Spectrum]:
         no_lane = wo.z > 2
-        together, _ = case.plugin.eval_pdf(ctx, si, wo, no_lane)
-        return [case.plugin.eval(ctx, si, wo, no_lane), together]
+        together, _ = method(case.plugin, "eval_pdf")(ctx, si, wo, active=no_lane)
+        return [method(case.plugin, "eval")(ctx, si, wo, active=no_lane), together]
 
     if not is_scalar():  # where Mitsuba takes ``active`` out of its plugins
         values = case.ask(switched_off, p)
@@ -326,7 +326,7 @@ def _at_random(case: BsdfCase, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, d
     bs, weight = sample(context(), probe.interaction(wi, uv), u.x, mi.Point2f(u.y, u.z))
     weight = mi.unpolarized_spectrum(weight)
     lit = dr.any(weight != 0)
-    value, pdf = case.plugin.eval_pdf(context(), probe.interaction(wi, uv), bs.wo, lit)
+    value, pdf = method(case.plugin, "eval_pdf")(context(), probe.interaction(wi, uv), bs.wo, active=lit)
     value = mi.unpolarized_spectrum(value)
     bad = probe.bad_samples(weight, bs.wo, bs.pdf, bs.eta, value, pdf)
     return bad, {"wi": wi, "uv": uv, "u": u}

@@ -388,9 +388,9 @@ def _directions(case: EmitterCase, u: Array) -> Array:
 
     def call(u: mi.Point2f) -> list[mi.Float]:
         it = case.from_first()
-        ds, weight = case.plugin.sample_direction(it, u)
+        ds, weight = method(case.plugin, "sample_direction")(it, u)
         weight = mi.unpolarized_spectrum(weight)
-        value = mi.unpolarized_spectrum(case.plugin.eval_direction(it, ds))
+        value = mi.unpolarized_spectrum(method(case.plugin, "eval_direction")(it, ds))
         return [ds.d, dr.all(weight == 0) & dr.any(value > 0)]
 
     d, refused = lanes(call, ("Point2f", u))
@@ -429,6 +429,7 @@ def weights(law: Outcome, case: EmitterCase) -> None:
 @measures(
     reads=most(READS, 0, READS_WHY),
     bad=number_of("samples that are not finite, or negative, or not of unit length", 0, SPOILS, SAMPLED),
+    seen=number_of("values of eval(), where it is seen, that are not finite, or negative", 0, SPOILS),
     million=most(
         "samples of {count} from one point that are not finite, or negative, or whose direction is not of "
         "length 1",
@@ -444,7 +445,21 @@ def finite(law: Outcome, case: EmitterCase) -> None:
         length = abs(norm(np.float64(s.d), axis=1) - 1)
         usable = (length <= LENGTH_TOL) & np.isfinite(s.dist) & (s.pdf >= 0)
         law.check("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable), s, placed=case.placed)
+        seen = _seen_anywhere(case)
+        law.check("seen", ~(np.isfinite(seen) & (seen >= 0)).all(axis=1))
         judge_many(law, case, partial(_at_random, case))
+
+
+def _seen_anywhere(case: EmitterCase) -> Array:
+    """eval() where uniform rays meet a lamp, or in directions all around, [N, channels]."""
+    if case.lamp:
+        view = View(probe.corners(case.surface))
+        o = view.around(case, case.count(2**16, 2**18))
+        met, _, value, _ = case.met(o, view.into_cone(o, case.rng))
+        return value[met]
+    if case.around:
+        return case.seen(case.units(case.count(2**16, 2**18)))[1]
+    return np.zeros((1, 1))
 
 
 def _at_random(case: EmitterCase, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:

@@ -103,11 +103,19 @@ def at_wavelengths(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
 
 def _fits(value: Any, kind: str) -> bool:
     """Whether Mitsuba takes a value for a type of the current variant."""
-    if kind == "Spectrum":
-        return bool(dr.is_arithmetic_v(value)) and not isinstance(value, bool)
-    if kind == "Float":
-        return bool(dr.is_arithmetic_v(value)) and dr.depth_v(value) <= dr.depth_v(mi.Float)
-    return isinstance(value, getattr(mi, kind))
+    if kind not in ("Spectrum", "Float"):
+        return isinstance(value, getattr(mi, kind))
+    if not dr.is_array_v(value):
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return bool(dr.is_arithmetic_v(value)) and (
+        kind == "Spectrum" or dr.depth_v(value) <= dr.depth_v(mi.Float)
+    )
+
+
+def _cast(value: Any, kind: str) -> Any:
+    """Return a value as Mitsuba converts it: a number also counts as a color."""
+    wanted = getattr(mi, kind)
+    return value if isinstance(value, wanted) else wanted(value)
 
 
 def method(plugin: mi.Object, name: str) -> Call:
@@ -116,14 +124,15 @@ def method(plugin: mi.Object, name: str) -> Call:
     It raises ``TypeError`` where the plugin returns another type.
     """
 
-    def call(*given: Any) -> Any:
-        answer = getattr(plugin, name)(*given, mi.Bool(True))
+    def call(*given: Any, active: Any = True) -> Any:
+        answer = getattr(plugin, name)(*given, mi.Bool(active))
         kinds = RETURNS[name]
         parts = answer if isinstance(answer, tuple | list) else (answer,)
         if len(parts) != len(kinds) or not all(map(_fits, parts, kinds)):
             what = ", ".join(type(part).__name__ for part in parts)
             raise TypeError(f"{name}() returned {what}: it must return {', '.join(kinds)}")
-        return answer
+        taken = [_cast(part, kind) for part, kind in zip(parts, kinds, strict=True)]
+        return taken if len(kinds) > 1 else taken[0]
 
     return call
 

@@ -428,6 +428,14 @@ SCALED_BOX = """box = load(to_world=mi.ScalarTransform4f({matrix})).bbox()
 print("as it is:", shape.bbox(), "scaled by 2^{power}:", box)
 """
 
+MOVED = """print("as it is, t:", scene.ray_intersect(mi.Ray3f(o, d)).t)
+scene = mi.load_dict({{"type": "scene", "shape": load(to_world=mi.ScalarTransform4f({matrix}))}})
+moved = mi.Ray3f(mi.Point3f({start}), mi.Vector3f({way}))
+print("turned and moved, and the ray with it, t:", scene.ray_intersect(moved).t)
+"""
+TURN = np.array([[0.8, -0.6, 0], [0.48, 0.64, -0.6], [0.36, 0.48, 0.8]])  # in steps of 37° about two axes
+OFFSET = np.array([0.5, -1, 2])  # in sizes
+
 
 @measures(
     box=most(
@@ -448,9 +456,18 @@ print("as it is:", shape.bbox(), "scaled by 2^{power}:", box)
         "some dozen operations, on scaled numbers",
         SCALED,
     ),
+    moved=share_of(
+        "share of rays answered otherwise where the shape and they are turned and moved",
+        1e-2,
+        "to_world applies to all of it; rays next to edges may miss them",
+        MOVED,
+    ),
 )
 def scale(law: Outcome, case: ShapeCase) -> None:
-    """At a millionth and a million times the size, hits are the same, scaled; powers of two round nothing."""
+    """At a millionth and a million times the size, hits are the same, scaled; and so they are elsewhere.
+
+    Powers of two round nothing.
+    """
     matrix = getattr(case.with_().get("to_world"), "values", np.eye(4))
     seen = case.few(case.seen, 2**12, 2**14)
     for power in (-20, -10, 10, 20):
@@ -469,6 +486,21 @@ def scale(law: Outcome, case: ShapeCase) -> None:
         both = seen.steep & there.met
         for name, errors, judged in (("answer", there.met != seen.met, seen.clear), ("off", error, both)):
             law.check(name, errors, seen, where=judged, power=power, matrix=larger.tolist())
+    _elsewhere(law, case, seen, matrix)
+
+
+def _elsewhere(law: Outcome, case: ShapeCase, seen: Lanes, matrix: Array) -> None:
+    """Compare hits with those of the shape and the rays, both turned and moved."""
+    place = np.eye(4)
+    place[:3, :3] = TURN
+    place[:3, 3] = OFFSET * case.size
+    start = np.float32(seen.o @ TURN.T + place[:3, 3])
+    way = unit(seen.d @ TURN.T)
+    matrix = place @ matrix
+    there = trace(case.scene(to_world=mi.ScalarTransform4f(matrix)), start, way)
+    error = there.met != seen.met
+    error |= there.met & seen.met & ~(abs(there.t / seen.t - 1) < 1e-3)
+    law.check("moved", error, seen, where=seen.clear, matrix=matrix.tolist(), start=start, way=way)
 
 
 TWICE = """for o in (o, mi.Point3f({other})):
