@@ -52,10 +52,12 @@ def check(quick: bool) -> Image.Image:
     ):
         found.save(folder)
         browser = chromium.launch(playwright)
-        page = browser.new_page(viewport={"width": 1000, "height": 700})
+        page = browser.new_page(viewport={"width": 1240, "height": 700})
         page.goto(f"file://{folder}/index.html")
-        law = page.locator("article", has=page.locator("h3 code", has_text="weights"))
-        shot = law.screenshot()
+        law = page.locator("article", has=page.locator("h3 code", has_text="energy"))
+        box = law.bounding_box()
+        clip = {"x": 0, "y": box["y"], "width": 1240, "height": 850}
+        shot = page.screenshot(full_page=True, clip=clip)
         browser.close()
     return Image.open(io.BytesIO(shot)).convert("RGB")
 
