@@ -205,6 +205,23 @@ def statements(trees: Iterable[ast.Module]) -> list[int]:
     return sizes
 
 
+RENDERED = """
+import sys
+import mrt_mitsuba as mrt
+mrt.render(3, width=16, height=12, variant="llvm_ad_rgb")
+files = {getattr(module, "__file__", None) for module in [*sys.modules.values()]}
+print(*(file for file in files if file and file.endswith(".py")), sep="\\n")
+"""
+REACH = 62_000  # nodes of what a plain render imports: take something out before you raise it
+
+
+def test_a_plain_render_imports_little(run_python):
+    files = {Path(line).resolve() for line in run_python(RENDERED).stdout.splitlines()}
+    own = [file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py") if file in files]
+    assert len(own) > 30
+    assert sum(statements(ast.parse(file.read_text()) for file in own)) <= REACH
+
+
 def swaps(node: ast.AST) -> bool:
     """Is a node an assignment of several values to as many names?"""
     return (
