@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#aa4499", "#56b4e9", "#e69f00", "#6a3d9a", "#8c510a")
 GREY = "#8a8f98"
 FONT = 9.0  # points
-MAPS = {"error.Y": "stated error of each pixel", "samples.Y": "rays of each pixel"}  # titles by layer
+MAPS = {"error.Y": "standard error of each pixel", "samples.Y": "samples of each pixel"}  # titles by layer
 
 
 def panels(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:
@@ -81,7 +81,7 @@ def show_map(axes: Axes, values: np.ndarray) -> None:
 
 
 def maps(result: Any) -> list[Figure]:
-    """Return plots of the stated error and the rays of each pixel of an adaptive render."""
+    """Return plots of the reported error and the samples of each pixel of an adaptive render."""
     height, width = result.image.shape[:2]
     figures = []
     for layer, title in MAPS.items():

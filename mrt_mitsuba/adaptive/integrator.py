@@ -41,7 +41,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
     ``denoise``      boolean     false    mix the picture with its denoised version where that errs less
     ``max_spp``      integer     4096     >= 8, rays of a pixel at most, on average
     ``max_seconds``  float       0        >= 0, time to spend at most; 0 for no limit
-    ``spp``          integer     (none)   >= 8, in place of ``target``: a mean of so many rays a pixel
+    ``spp``          integer     (none)   >= 8, in place of ``target``: average samples per pixel
     (any name)       integrator           required: the nested integrator, any but ``mrt_adaptive``
     ================ =========== ======== ================================================================
 
@@ -81,7 +81,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         self.goal = _goal(props)
 
     def bounded(self, spp: int) -> Goal:
-        """The goal with a bound of ``spp`` rays a pixel on average, as ``mi.render`` gives it; 0: none."""
+        """Return the goal with an average of ``spp`` samples per pixel at most, as ``mi.render`` gives it."""
         if not spp:
             return self.goal
         most = spp if self.goal.target is None else min(self.goal.max_spp, spp)
@@ -102,7 +102,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         from mrt_mitsuba.scene.open import opened
 
         if 0 < spp < MIN_SPP:
-            warn(f"mrt_adaptive takes {MIN_SPP} rays a pixel at least, not spp={spp}")
+            warn(f"mrt_adaptive takes {MIN_SPP} spp at least, not spp={spp}")
         number = sensor if isinstance(sensor, int) else 0
         view = _sensor(scene, sensor)
         seed = int(np.ravel(seed)[0]) % 2**32

@@ -148,7 +148,7 @@ def run_rounds(
         rmse = plain if denoised is None else denoised.rmse
         now = Round(time.perf_counter() - start, spent / pixels, rmse)
         done.append(now)
-        log.info("round %d: %.1f rays a pixel, error %.3g", len(done), now.spp, now.rmse)
+        log.info("round %d: %.1f spp, error %.3g", len(done), now.spp, now.rmse)
         stopped = on_round is not None and on_round(_shown(now, stats, target, blurred, denoised)) is False
         if stopped or target == 0 or (denoised and target and cautious_error(denoised) <= target):
             break
@@ -269,7 +269,7 @@ def _target_warning(goal: Goal, now: Round, target: float | None) -> str:
     limit = f"maxseconds={seconds:g}" if late else f"maxspp={goal.max_spp}"
     return (
         f"{asked} is not reached: {limit} ends the render at {kind} of {now.rmse:.3g}, after "
-        f"{now.spp:.1f} rays a pixel and {now.seconds:.1f} s"
+        f"{now.spp:.1f} spp and {now.seconds:.1f} s"
     )
 
 
@@ -283,4 +283,4 @@ def _message(done: list[Round], target: float | None, more: float) -> str:
         aim = f" → {target:.2g}"
         seconds = now.seconds * max(min(now.rmse / target, 1e6) ** 2 - 1, 0)  # squares fall as time goes by
         left = f", about {seconds:.0f} s left" if seconds < 1e6 else ""
-    return f"error {now.rmse:.2g}{aim}{left}, {now.spp:.0f} rays a pixel, now {more:.0f} more"
+    return f"error {now.rmse:.2g}{aim}{left}, {now.spp:.0f} spp, now {more:.0f} more"

@@ -115,7 +115,7 @@ class NotebookProgress(TerminalProgress):
 
         encoded = base64.b64encode(png(picture.image)).decode()
         target = "" if picture.target is None else f" (target {picture.target:.2g})"
-        caption = f"error {picture.rmse:.2g}{target}, {picture.spp:.0f} rays a pixel, {picture.seconds:.1f} s"
+        caption = f"error {picture.rmse:.2g}{target}, {picture.spp:.0f} spp, {picture.seconds:.1f} s"
         self._picture = f'<img src="data:image/png;base64,{encoded}" alt="{caption}">'
         self._caption = caption
         self._show(caption)

@@ -132,10 +132,10 @@ def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):
     assert shown.pop().startswith(f"error {result.rounds[-1].rmse:.2g}")
     after = shown[::2]  # between them, what the next round adds
     assert len(after) == len(result.rounds)
-    assert all(re.search(r"rays a pixel, now \d+ more$", html) for html in shown[1::2])
+    assert all(re.search(r"spp, now \d+ more$", html) for html in shown[1::2])
     for html, found in zip(after, result.rounds, strict=True):
         assert html.startswith('<img src="data:image/png;base64,')
-        assert f"error {found.rmse:.2g}, {found.spp:.0f} rays a pixel" in html
+        assert f"error {found.rmse:.2g}, {found.spp:.0f} spp" in html
 
 
 class Terminal(io.StringIO):

@@ -86,7 +86,7 @@ def test_rays_are_bounded_and_seeds_matter():
     bounded = mi.load_dict({"type": "mrt_adaptive", "target": 1e-3, "max_spp": 16, "inner": {"type": "path"}})
     with pytest.warns(UserWarning, match="maxspp=16 ends the render"):
         assert np.array(mi.render(scene, integrator=bounded, spp=128))[..., -1].mean() <= 16
-    with pytest.warns(UserWarning, match="takes 8 rays a pixel at least, not spp=4"):
+    with pytest.warns(UserWarning, match="takes 8 spp at least, not spp=4"):
         assert np.array(mi.render(scene, spp=4))[..., -1].mean() == 8
 
 

@@ -115,7 +115,7 @@ def by_tenths(stated: Array, true: Array) -> tuple[Array, Array]:
 
 
 def tenths(scene: Any, *, seeds: int, truth_spp: int, spp: int = 64) -> tuple[Array, Array]:
-    """Return the stated and the true error of tenths of the pixels [10], sorted by the stated one.
+    """Return the reported and the true error of deciles of the pixels [10], sorted by the reported one.
 
     Of renders by ``path`` with a mean of ``spp`` rays a pixel, allocated by variance, one for each seed. The
     noise of the truth is subtracted from its squares.
@@ -131,10 +131,10 @@ def tenths(scene: Any, *, seeds: int, truth_spp: int, spp: int = 64) -> tuple[Ar
 
 
 def stated_and_true(scene: Any, *, seeds: int = 8, truth_spp: int = 2048) -> Figure:
-    """Plot the true over the stated error of tenths of the pixels of a loaded scene."""
+    """Plot the true over the reported error of deciles of the pixels of a loaded scene."""
     stated, true = tenths(scene, seeds=seeds, truth_spp=truth_spp)
-    drawn, axes = plotting.panel("tenths of the pixels, by stated error")
-    plotting.logarithmic(axes, "stated error", "true error")
+    drawn, axes = plotting.panel("deciles of the pixels by reported error")
+    plotting.logarithmic(axes, "reported error", "true error")
     span = np.array([min(stated.min(), true.min()) / 1.3, max(stated.max(), true.max()) * 1.3])
     axes.fill_between(span, span / 3, span * 3, color="0.93", label="within a factor of 3")
     axes.plot(span, span, color="black", linewidth=0.8)
