@@ -558,10 +558,12 @@ def test_mean_of_seeds(address, tmp_path):
     options: dict[str, Any] = {"width": 48, "height": 32, "integrator": "path"}
     mrt.register()
     scene = mi.cornell_box()
-    table = mrt.sweep(scene, tmp_path, grid={"seed": range(8)}, spp=4, cluster=address, **options)
+    more = {"spp": 4, "layers": ["samples"], "cluster": address}
+    table = mrt.sweep(scene, tmp_path, grid={"seed": range(8)}, **more, **options)
     mean = table.mean()
     pictures = np.stack([read_exr(tmp_path / row["file"]).image for row in table.rows])
     assert np.allclose(mean.image, pictures.mean(0), rtol=1e-6)  # sums in float32
+    assert (mean.layers["samples.Y"] == 8 * 4).all()
     deviation = np.sqrt(pictures.astype(np.float64).var(0, ddof=1).mean(-1) / 8)
     assert np.allclose(mean.layers["error.Y"], deviation, rtol=1e-4, atol=1e-6)
     converged = mrt.render(scene, spp=2048, seed=99, **options).image

@@ -267,6 +267,16 @@ def test_lobes_are_chosen_by_their_mean_reflectance(diffuse, specular, share):
     assert drawn.weight.max() < 1.005 * brightest
 
 
+@pytest.mark.parametrize("name", ["alpha", "int_ior", "ext_ior"])
+def test_updates_that_are_no_number_give_finite_values(name):
+    made = bsdf()
+    params = mi.traverse(made)
+    params[name] = float("nan")
+    params.update()
+    wo = mi.Vector3f(0, -0.6, 0.8)
+    assert np.isfinite(made.eval(mi.BSDFContext(), interaction([0, 0.6, 0.8]), wo)).all()
+
+
 def test_colours_and_numbers_from_textures():
     """Every parameter from a texture gives what the same number gives."""
 
