@@ -17,6 +17,7 @@ class Metric:
 
     name = "linear"
     reference: float | None = None  #: value to which a target in percent refers; None: the mean luminance
+    whole = "the mean luminance"  #: the same in words
 
     def encode(self, values: np.ndarray) -> np.ndarray:
         """Values whose differences are errors."""
@@ -57,6 +58,7 @@ class RelativeMetric(Metric):
 
     name = "relative"
     reference = 1.0
+    whole = "the true values"
 
     def encode(self, values: np.ndarray) -> np.ndarray:
         return np.arcsinh(values / np.float32(OFFSET))  # its slope is 1/√(x² + 0.01)
@@ -73,6 +75,7 @@ class DisplayMetric(Metric):
 
     name = "display"
     reference = 1.0
+    whole = "full white"
 
     def encode(self, values: np.ndarray) -> np.ndarray:
         clipped = np.clip(values, 0, 1)

@@ -14,6 +14,7 @@ from cases import Cases
 from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
+from mrt_mitsuba.command.main import main
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.rendering import exposing
 from mrt_mitsuba.rendering.plan import Rounds
@@ -105,6 +106,16 @@ def test_a_plan_holds_what_the_integrator_states_and_the_caller_asks(stated, opt
     assert goal.max_spp == most
     assert (goal.target and goal.target.plain) == target
     assert result.options.get("target") == target
+
+
+@pytest.mark.parametrize(
+    ("metric", "whole"),
+    [("linear", "the mean luminance"), ("relative", "the true values"), ("display", "full white")],
+)
+def test_the_command_says_what_a_percentage_is_of(metric, whole, tmp_path, capsys):
+    path = str(tmp_path / "picture")
+    main([path, "0", "width=16", "height=12", "focaldist=0", "target=50%", f"metric={metric}"])
+    assert f", 50% of {whole}\n" in capsys.readouterr().out
 
 
 def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):
