@@ -13,7 +13,7 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import cycle
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
@@ -143,12 +143,17 @@ class Race:
     error: float
     times: Mapping[str, tuple[float, float, float]]  #: seconds and their interval, by curve
     case: str  #: the fastest case of the first curve that comes so low
+    doubtful: Mapping[str, float] = field(default_factory=dict)
+    """The least seconds of curves that stay above the error, but may come so low by their intervals."""
 
     @property
     def rivals(self) -> list[str]:
         """Curves whose intervals overlap with that of the first one: then there is no winner."""
         best, *others = self.times or [""]
-        return [name for name in others if not self.times[best][2] < self.times[name][1]]
+        if not best:
+            return []
+        least = {name: self.times[name][1] for name in others} | dict(self.doubtful)
+        return [name for name, seconds in least.items() if not self.times[best][2] < seconds]
 
     @property
     def longer(self) -> float:
@@ -231,13 +236,15 @@ class Findings:
 
     def race(self, error: float) -> Race:
         """Which curves come down to an error, and when."""
-        times = {name: t for name, t in self.time_to(error).items() if math.isfinite(t[0])}
+        every = self.time_to(error)
+        times = {name: t for name, t in every.items() if math.isfinite(t[0])}
         times = dict(sorted(times.items(), key=lambda item: item[1]))
+        doubtful = {name: t[1] for name, t in every.items() if name not in times and math.isfinite(t[1])}
         case = ""
         if times:
             points = self.families[next(iter(times))]  # the fastest first
             case = next(p.name for p in points if p.rmse <= error * (1 + 1e-9))
-        return Race(error, times, case)
+        return Race(error, times, case, doubtful)
 
     @property
     def verdicts(self) -> list[str]:

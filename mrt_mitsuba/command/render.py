@@ -42,7 +42,6 @@ def run(options: Options) -> int:
 
         runtime.use(options.variant)
         import_plugins(options.plugins)
-        from mrt_mitsuba.adaptive.metric import METRICS
         from mrt_mitsuba.rendering.api import render
     if spared:
         gc.freeze()
@@ -59,7 +58,7 @@ def run(options: Options) -> int:
             target = result.error.target
             aim = "" if target is None else f"; target {target:.3g}"
             if target is not None and options.error is not None and options.error.relative:
-                aim += f", {options.error} of {METRICS[result.error.metric].whole}"
+                aim += f", {options.error} of {result.error.whole}"
             print(f"Error: {result.error}, {result.rounds[-1].spp:.1f} spp{aim}")
         print(f"Wrote {printable(' and '.join(options.outputs()))}")
         print(f"Render time: {seconds:.6f}s")

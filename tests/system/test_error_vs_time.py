@@ -251,6 +251,15 @@ def test_a_winner_is_named_only_if_intervals_are_apart(times, rmse, errors, verd
     assert row["next best"] == ("b" if verdict.endswith(NAMED) else None)
 
 
+@pytest.mark.parametrize(("spread", "use"), [(1e-3, "a"), (0.5, "no winner: a; b")])
+def test_a_curve_that_may_come_so_low_has_not_lost(spread, use):
+    """The error of b is 0.11; pictures that differ widely leave in doubt whether it is 0.1."""
+    gram = 0.11**2 * np.diag(1 + spread * np.array([-1, 1, -1, 1]))
+    times = [1.0, 1.1, 0.9, 1.05]
+    (row,) = found_of(point("a", times), point("b", times, 0.11, gram)).advice()
+    assert row["use"] == use
+
+
 @pytest.mark.parametrize("count", [3, 5, 10])
 def test_intervals_cover_what_they_should_and_equal_cases_have_no_winner(count):
     """95 % of them, of log-normal times as a busy machine makes them, and of pictures with a bias.
