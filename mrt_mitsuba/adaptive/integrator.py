@@ -81,7 +81,10 @@ class MrtAdaptive(mi.SamplingIntegrator):
         self.goal = _goal(props)
 
     def bounded(self, spp: int) -> Goal:
-        """Return the goal with an average of ``spp`` samples per pixel at most, as ``mi.render`` gives it."""
+        """Return the goal with an average of ``spp`` samples per pixel at most, as ``mi.render`` gives it.
+
+        0: no bound.
+        """
         if not spp:
             return self.goal
         most = spp if self.goal.target is None else min(self.goal.max_spp, spp)

@@ -80,7 +80,6 @@ SETTINGS({"target": 0.05, "maxspp": 64})
 SETTINGS({"target": "5%", "maxspp": 64})
 
 
-@pytest.mark.filterwarnings("ignore::mrt_mitsuba.errors.MrtWarning")
 @pytest.mark.parametrize("rfilter", ["gaussian", "lanczos"])
 def test_rows_added_one_by_one_are_those_added_together(rfilter):
     """Also where a filter reaches beyond the pictures from a row, at either end."""
@@ -101,6 +100,7 @@ def test_rows_added_one_by_one_are_those_added_together(rfilter):
     assert (rows.weights == whole.weights).all()
 
 
+@pytest.mark.filterwarnings("ignore::mrt_mitsuba.errors.MrtWarning")
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 3e38])
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 @pytest.mark.parametrize("options", SETTINGS)
