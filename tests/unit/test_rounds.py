@@ -390,3 +390,10 @@ def test_errors_are_in_the_metric_that_is_asked_for(metric):
     plain = _render(Draws(_calm), rays=64).error
     assert error.metric == metric
     assert 0.2 < error.rmse / plain.rmse < (0.6 if metric == "display" else 1.3)
+
+
+@pytest.mark.parametrize(("error", "missed"), [(0.01, False), (0.0105, True)])
+def test_a_target_that_is_missed_by_little_is_named(error, missed):
+    now = rounds.Round(seconds=1.0, spp=64.0, rmse=error)
+    said = rounds._target_warning(rounds.Goal(Target(0.01), 64), now, 0.01)
+    assert ("is not reached: maxspp=64" in said) is missed
