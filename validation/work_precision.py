@@ -214,7 +214,11 @@ class Findings:
     @property
     def warning(self) -> str:
         """What the reference is too coarse for; "" if nothing."""
-        coarse = [point.name for point in self.points.values() if point.rmse > 0 and not point.resolved]
+        coarse = [
+            point.name
+            for point in self.points.values()
+            if not point.resolved and max(point.rmse, self.reference_error) > 0
+        ]
         if not coarse:
             return ""
         return (

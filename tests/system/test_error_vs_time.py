@@ -260,6 +260,13 @@ def test_a_curve_that_may_come_so_low_has_not_lost(spread, use):
     assert row["use"] == use
 
 
+@pytest.mark.parametrize("reference_error", [0.0, 0.1])
+def test_a_case_with_no_error_left_is_not_resolved_by_a_coarse_reference(reference_error):
+    best = replace(point("best", [1.0] * 3, 0.0), reference_error=reference_error)
+    found = replace(found_of(best), reference_error=reference_error)
+    assert ("about best" in found.warning) is (reference_error > 0)
+
+
 @pytest.mark.parametrize("count", [3, 5, 10])
 def test_intervals_cover_what_they_should_and_equal_cases_have_no_winner(count):
     """95 % of them, of log-normal times as a busy machine makes them, and of pictures with a bias.
