@@ -247,7 +247,7 @@ def test_attributes_come_back_or_are_refused(tmp_path, image, name, value, expec
         assert output.read_exr(tmp_path / "a.exr").header[name] == expected
 
 
-@pytest.mark.parametrize("step", ["fsync", "fchmod", "replace"])
+@pytest.mark.parametrize("step", ["fsync", "chmod", "replace"])
 def test_interrupt_leaves_all_files_old_or_makes_all_new(tmp_path, monkeypatch, heeded, image, step):
     paths = old(tmp_path, ["png", "exr"])
     before = getattr(os, step)
