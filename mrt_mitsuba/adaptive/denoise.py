@@ -49,7 +49,13 @@ class Denoiser:
             np.where(unknown, np.nan, stats.film.picture(half[..., :3])) for half in stats.halves.pictures()
         ]
         albedo, normal = self._known
-        found = denoise(halves[0], halves[1], albedo, normal, encode=stats.metric.encode)
+        unfiltered = None
+        if stats.film.reach:
+            means = stats.sum[:, :2] / stats.count[:2]
+            unfiltered = tuple(stats.film.picture(np.moveaxis(means[:, k], 0, -1)) for k in (0, 1))
+        found = denoise(
+            halves[0], halves[1], albedo, normal, encode=stats.metric.encode, unfiltered=unfiltered
+        )
         plain = stats.image()[..., :3].astype(np.float32)
         self._measured = (plain_error, cautious_error(found))
         return replace(found, noisy=plain, image=np.where(unknown, plain, found.image))

@@ -200,7 +200,18 @@ def plan_round(
         return _top_up(allocator, stats, seen, most, target, now)
     if required > TRUSTED_GROWTH * now.spp:  # variance may fall as fast as spp^−(1 + gain)
         required = now.spp * (required / now.spp) ** (1 / (1 + allocator.gain))
-    return allocator.allocate(stats, seen, min(most, required))
+    return _some(allocator, stats, seen, min(most, required), most)
+
+
+def _some(
+    allocator: Allocator, stats: SampleStatistics, seen: Forecast, spp: float, most: float
+) -> np.ndarray:
+    """Return an allocation that raises the mean to ``spp``, or further where whole groups exceed that."""
+    allocation = allocator.allocate(stats, seen, spp)
+    while spp < most and not allocation.any():
+        spp = min(1.2 * spp, most)
+        allocation = allocator.allocate(stats, seen, spp)
+    return allocation
 
 
 def _top_up(
@@ -210,7 +221,7 @@ def _top_up(
     if now.rmse <= target:
         return None
     growth = (now.rmse / (TARGET_MARGIN * max(target, 1e-100))) ** 2
-    return allocator.allocate(stats, seen, min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1)))
+    return _some(allocator, stats, seen, min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1)), most)
 
 
 def _shown(

@@ -54,6 +54,7 @@ def denoise(
     normal: Image | None = None,
     *,
     encode: Encode | None = None,
+    unfiltered: tuple[Image, Image] | None = None,
 ) -> Denoised:
     """Denoise two independent renders of a picture, and mix the result with their mean where that errs less.
 
@@ -64,6 +65,8 @@ def denoise(
         normal: shading normals of first hits, [H, W, 3] in [-1, 1].
         encode: function of linear values whose differences count as errors, such as the sRGB curve; None: the
             values themselves.
+        unfiltered: the means of the samples in each pixel of the two renders, [H, W, 3] each, which are
+            denoised in their place; noise that a reconstruction filter has spread over pixels hardly is.
 
     Pixels that are not finite in a render are taken from the mean as they are, and count in no error.
 
@@ -82,7 +85,8 @@ def denoise(
         noisy = (halves[0] + halves[1]) / 2
         valid = np.isfinite(noisy).all(-1) & np.isfinite(halves[0] - halves[1]).all(-1)
     halves = [np.where(valid[..., None], half, 0) for half in halves]
-    denoised = [_open_image_denoise(half, albedo, normal) for half in halves]
+    inputs = halves if unfiltered is None else [np.asarray(half, np.float32) for half in unfiltered]
+    denoised = [_open_image_denoise(half, albedo, normal) for half in inputs]
     estimates = _Estimates.of(halves, denoised, encode or np.asarray, valid)
     weight = estimates.best_weight()
     share = weight[..., None]

@@ -62,6 +62,19 @@ def test_what_does_not_pay_is_left_out():
     assert found.rounds[-1].spp < 1.2 * plain.rounds[-1].spp
 
 
+def test_samples_that_a_filter_shares_are_denoised_before_it(calm):
+    """Noise of pixels that share samples hardly is; and a target is reached, though whole groups of samples
+    in whole regions are more than a round needs."""
+    box = mi.cornell_box()
+    box["sensor"]["film"] |= {"width": SIZE, "height": SIZE, "rfilter": {"type": "gaussian"}}
+    scene = mi.load_dict(box)
+    options = {"integrator": "path", "target": "1.5%", "metric": "display"}
+    found = mrt.render(scene, denoise=True, **options)
+    assert found.error.rmse <= found.error.target
+    assert found.layers["denoised.Y"].mean() > 0.5
+    assert found.rounds[-1].spp < 0.8 * mrt.render(scene, **options).rounds[-1].spp
+
+
 def test_mrt_adaptive_denoises(calm):
     nested = {"type": "mrt_adaptive", "spp": 64, "denoise": True, "nested": {"type": "path", "max_depth": 5}}
     shown = np.array(mi.render(calm, integrator=mi.load_dict(nested)))
