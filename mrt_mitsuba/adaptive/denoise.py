@@ -51,8 +51,8 @@ class Denoiser:
         albedo, normal = self._known
         unfiltered = None
         if stats.film.reach:
-            means = stats.sum[:, :2] / stats.count[:2]
-            unfiltered = tuple(stats.film.picture(np.moveaxis(means[:, k], 0, -1)) for k in (0, 1))
+            means = np.moveaxis(stats.sum[:, :2] / stats.count[:2], 0, -1)  # [2, H, W, 3]
+            unfiltered = (stats.film.picture(means[0]), stats.film.picture(means[1]))
         found = denoise(
             halves[0], halves[1], albedo, normal, encode=stats.metric.encode, unfiltered=unfiltered
         )
