@@ -229,6 +229,12 @@ def test_a_mean_of_rays_is_spent(spp):
     assert 0.9 * spp <= spent <= spp
 
 
+@pytest.mark.parametrize("limits", [{"spp": 32, "maxspp": 1024}, {"spp": 1024, "maxspp": 32}], ids=str)
+def test_the_smaller_of_two_limits_counts(limits):
+    spent = mrt.render(_load("area_light"), aamode="noise", seed=1, **limits).rounds[-1].spp
+    assert 0.9 * 32 <= spent <= 32
+
+
 def test_rays_go_where_the_noise_is():
     """The same error takes fewer rays than Mitsuba takes: in a sky without noise, none but the first."""
     scene = _load("texture_and_sky")
