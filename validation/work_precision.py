@@ -574,6 +574,8 @@ def diagram(title: str, found: Findings) -> Figure:
         label = "within the reference's own error"
         axes.axhspan(bottom / 10, found.reference_error, color="0.9", zorder=0, label=label)
     axes.set_ylim(bottom=0.8 * bottom)
+    if len(points) == 1:  # a single value spans no axis
+        axes.set_xlim(points[0].seconds / 2, 2 * points[0].seconds)
     plotting.plain_numbers(axes)
     plotting.legend(axes)
     return drawn
