@@ -171,7 +171,7 @@ class Passes:
             self._layer("variance")[:] = variance[self._padded]
             self._layer("error")[..., 0] = error[self._padded]
         self._layer("samples")[..., 0] = stats.samples()[self._padded]
-        if denoiser and denoiser.left_out:
+        if denoiser and denoiser.left_out and finished.denoised is None:
             self.left_out = ("denoising", denoiser.left_out)
         if step.goal.denoise:
             denoised = finished.denoised

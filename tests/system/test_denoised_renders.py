@@ -51,7 +51,7 @@ def test_a_target_takes_fewer_rays(calm, metric, target):
     assert found.rounds[-1].rmse == found.error.rmse
 
 
-def test_what_does_not_pay_is_left_out():
+def test_what_does_not_pay_is_left_out(calm):
     """Of a chessboard far finer than pixels, a denoiser knows nothing that rays do not say sooner."""
     scene = load_kind("texture", SIZE)
     found = mrt.render(scene, target=0.003, denoise=True)
