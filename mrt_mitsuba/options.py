@@ -136,11 +136,6 @@ def _name(value: Any) -> str:
     return _only(value, str.isidentifier(value))
 
 
-def _rectangle(value: Any) -> tuple[int, ...]:
-    numbers = tuple(_whole(part) for part in value)
-    return _only(numbers, len(numbers) == 4 and min(numbers) >= 0 and min(numbers[2:]) >= 1)
-
-
 def _parameters(value: Any) -> dict[str, Any]:
     return _only(dict(value), all(isinstance(key, str) and key for key in value))
 
@@ -165,7 +160,6 @@ SWITCH = Kind("1|0", "1 or 0", _switch, lambda text: WORDS[text.lower()])
 NAME = Kind("NAME", "a name such as llvm_ad_rgb or scalar_rgb", _name)
 ANYTHING = instance(object, "anything")  # checked where it is used
 FUNCTION = Kind("", "a function", lambda value: _only(value, callable(value)))
-RECTANGLE = Kind("", "four whole numbers: column, row, width and height in pixels", _rectangle)
 PARAMETERS = Kind(
     "",
     "a dict of values by names of an XML file or keys of mi.traverse, such as material_0.alpha",

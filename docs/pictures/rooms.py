@@ -86,7 +86,7 @@ BOXES = (
         310,
         170,
         110,
-        ("edges, depth of field,", "denoising, contours:", "arrays in, arrays out"),
+        ("edges, depth of field,", "denoising:", "arrays in, arrays out"),
     ),
     Box("sweeps/", 650, 20, 150, 76, ("grids, frames, seeds", "in many processes")),
     Box("files/", 650, 150, 150, 90, ("table of layers,", "PNG and EXR")),

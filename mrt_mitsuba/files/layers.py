@@ -31,10 +31,6 @@ _FIRST_HITS = (
     ),
     Layer("normal", "XYZ", FIRST_HIT, "geometric normal", lambda r: r.at_hit("Vector3f", r.si.n)),
     Layer("albedo", "RGB", FIRST_HIT, "diffuse reflectance", lambda r: r.albedo),
-    Layer("position", "XYZ", FIRST_HIT, "place of the hit", lambda r: r.at_hit("Vector3f", r.si.p)),
-    Layer("uv", "UV", FIRST_HIT, "texture coordinates", lambda r: r.at_hit("Vector2f", r.si.uv)),
-    Layer("shape", "I", FIRST_HIT, "shape, from 1; 0 for none", lambda r: r.shape),
-    Layer("material", "I", FIRST_HIT, "material, from 1; 0 for none", lambda r: r.material),
 )
 _DERIVED = (
     Layer("edges", "Y", DERIVED, "what the edge detector measured"),

@@ -2,14 +2,7 @@
 
 from mrt_mitsuba.filters.denoise import Denoised, denoise
 from mrt_mitsuba.filters.dof import blur_amount, gaussian_dof
-from mrt_mitsuba.filters.edges import (
-    EdgeMap,
-    contours,
-    edges_image,
-    geometry_edges,
-    luma_edges,
-    sobel_edges,
-)
+from mrt_mitsuba.filters.edges import EdgeMap, geometry_edges, luma_edges, sobel_edges
 
-__all__ = ["Denoised", "EdgeMap", "blur_amount", "contours", "denoise", "edges_image"]
+__all__ = ["Denoised", "EdgeMap", "blur_amount", "denoise"]
 __all__ += ["gaussian_dof", "geometry_edges", "luma_edges", "sobel_edges"]

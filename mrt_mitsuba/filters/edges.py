@@ -29,7 +29,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
-import numpy as np
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.filters.grid import Grid, check_numbers, finite
@@ -41,9 +40,6 @@ if TYPE_CHECKING:
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 GREY_WEIGHTS = (0.07, 0.72, 0.21)
-# Between two pictures of contours; so that a contour at the border still shows
-GAP = 4  # pixels
-GREY = 0.5
 REACH = 1  # rows and columns of neighbours that a pixel depends on, either way
 
 
@@ -211,28 +207,6 @@ def geometry_edges(
     crease /= dr.opaque(grid.Float, 1 - math.cos(math.radians(crease_angle)))
     value = dr.select(finite(near), dr.maximum(step, crease), math.inf)
     return _edge_map(grid, value > 1, value)
-
-
-def edges_image(edges: EdgeMap) -> np.ndarray:
-    """The contours as a picture: [H, W] float32, 1 at an edge, else 0."""
-    return np.array(edges.mask).astype(np.float32)
-
-
-def contours(*edges: EdgeMap) -> np.ndarray:
-    """The contours of one or several detectors next to each other, [H, W', 3] float32: 1 at an edge, else 0.
-
-    Raises:
-        UsageError: for no detector, or pictures of different heights.
-    """
-    heights = {len(each.mask) for each in edges}
-    if len(heights) != 1:
-        raise UsageError(f"contours needs EdgeMaps of one height, at least one; given: {sorted(heights)}")
-    gap = np.full((heights.pop(), GAP), GREY, np.float32)
-    parts = [edges_image(edges[0])]
-    for each in edges[1:]:
-        parts += [gap, edges_image(each)]
-    grey = np.concatenate(parts, axis=1)  # [H, W']
-    return np.repeat(grey[..., None], 3, axis=-1)
 
 
 def _inner(grid: Grid) -> Mask:

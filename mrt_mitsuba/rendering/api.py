@@ -137,11 +137,9 @@ def render(
     fresnel: Literal["schlick", "dielectric"] | None = None,
     focaldist: float | None = None,
     focalrange: float | None = None,
-    dof: Literal["report", "corrected"] = "report",
     layers: Sequence[str] | str = (),
     motion: Sequence[float] | None = None,
     motionsamples: int = 16,
-    motionmode: Literal["frames", "stratified"] = "frames",
     convention: Convention = "report",
     texturing: Convention | None = None,
     camera: Sequence[float] | None = None,
@@ -157,7 +155,6 @@ def render(
     spp: int | None = None,
     count_rays: bool = False,
     params: Mapping[str, Any] | None = None,
-    region: Sequence[int] | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Render a scene.
@@ -171,8 +168,8 @@ def render(
     every pixel and ignore what noise explains; with one random sample they take noise for edges ("geometry"
     never does). With ``target``, samples are allocated adaptively until the estimated error reaches it.
 
-    ``motionmode="frames"`` averages ``motionsamples`` whole renders, as the report does; "stratified" is one
-    render whose samples are spread over the time while the shutter is open, that many or more in a pixel.
+    Motion blur averages ``motionsamples`` whole renders, as the report does; by the rules of a film, each
+    sample has a time of its own.
 
     Raises:
         UsageError: for an argument of the wrong type or range.
@@ -239,8 +236,8 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
         shader = Shader(source, settings.motion)
         plan = make_plan(source, shader, settings)
         workspace = Workspace.from_budget(
-            plan.padded_region.width,
-            plan.padded_region.height,
+            plan.width,
+            plan.height,
             plan.channels,
             pictures=min(plan.frames, 2),  # the frames' sum, and one of them
             rays_per_pixel=max(step.pattern.size for step in plan.passes),
@@ -273,8 +270,8 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
 
 
 def _frames(shader: Shader, plan: Plan, job: Job) -> Passes:
-    """Trace the plan's frames: the picture of the first one, with the mean of all in its layers, cut to the
-    region, [H, W, channels] each.
+    """Trace the plan's frames: the picture of the first one, with the mean of all in its layers,
+    [H, W, channels] each.
 
     Layers that are no averages are those of the first frame.
     """
@@ -287,11 +284,8 @@ def _frames(shader: Shader, plan: Plan, job: Job) -> Passes:
         following.run()
         for name in [*averaged, *({"samples"} & layers.keys())]:
             layers[name] += following.layers[name]
-    inside = plan.region.inside(plan.padded_region)
-    for name, values in layers.items():
-        if plan.frames > 1 and name in averaged:
-            values /= np.float32(plan.frames)
-        layers[name] = values[inside]
+    for name in averaged if plan.frames > 1 else ():
+        layers[name] /= np.float32(plan.frames)
     return picture
 
 

@@ -6,7 +6,6 @@ import math
 import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -49,29 +48,6 @@ def _array(variant: str, kind: str, number: float) -> mi.Float:
     return dr.opaque(getattr(mi, kind), number)
 
 
-class Region(NamedTuple):
-    """A rectangle of pixels; ``x`` is its first column and ``y`` its first row, counted from the top."""
-
-    x: int
-    y: int
-    width: int
-    height: int
-
-    def grown(self, reach: int, width: int, height: int) -> Region:
-        """Return the region padded by ``reach`` pixels, cut to the picture."""
-        left = max(self.x - reach, 0)
-        top = max(self.y - reach, 0)
-        right = min(self.x + self.width + reach, width)
-        bottom = min(self.y + self.height + reach, height)
-        return Region(left, top, right - left, bottom - top)
-
-    def inside(self, other: Region) -> tuple[slice, slice]:
-        """Return its rows and columns in an array of another region's pixels."""
-        top = self.y - other.y
-        left = self.x - other.x
-        return slice(top, top + self.height), slice(left, left + self.width)
-
-
 @dataclass(frozen=True)
 class SamplePattern:
     """Samples number ``first`` to ``first + count − 1`` in each pixel, each traced ``repeats`` times.
@@ -83,8 +59,7 @@ class SamplePattern:
 
     The shutter is open from time 0 to 1, divided into ``time_strata`` equal strata; successive rays of a
     pixel go to strata far from each other, so that position and time do not correlate. ``phase``: where in
-    its stratum a ray is, 0 to 1; None: at random, the same for all rays of a pixel and different in the next
-    pixel, which turns steps into noise.
+    its stratum a ray is, 0 to 1.
     """
 
     lattice: str = "report"
@@ -93,8 +68,7 @@ class SamplePattern:
     count: int = 1
     repeats: int = 1
     time_strata: int = 0  #: 0: all rays start at time 0
-    phase: float | None = 0.0
-    seed: int = 0  #: of random phases
+    phase: float = 0.0
 
     @property
     def size(self) -> int:
@@ -127,16 +101,12 @@ class SamplePattern:
         place = mi.Point2f((mi.Float(column) + x) / columns, (mi.Float(row) + y) / rows)
         if not self.time_strata:
             return place, mi.Float(0)
-        if self.phase is None:
-            phase = mi.sample_tea_float32(pixel, opaque(self.seed))
-        else:
-            phase = opaque(float(self.phase))
         # from one ray to the next, so many parts: coprime to their number, near its golden section
         golden = max(round(self.time_strata * (math.sqrt(5) - 1) / 2), 1)
         stride = next(s for s in range(golden, self.time_strata + 2) if math.gcd(s, self.time_strata) <= 1)
         moments = mi.UInt64(opaque(self.time_strata))
         part = mi.UInt64(ray) * mi.UInt64(opaque(stride)) % moments
-        return place, (mi.Float(part) + phase) / mi.Float(moments)
+        return place, (mi.Float(part) + opaque(float(self.phase))) / mi.Float(moments)
 
 
 class Film:

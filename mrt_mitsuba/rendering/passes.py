@@ -19,7 +19,6 @@ from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
 from mrt_mitsuba.plugins.signals import left_to_other_threads
 from mrt_mitsuba.rendering.exposing import FILM_PREFIX, Exposer, FilmAccumulator, RayBatch, widened
-from mrt_mitsuba.rendering.film import Region
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
 from mrt_mitsuba.rendering.seeds import derived_seed
@@ -46,8 +45,7 @@ class Passes:
         self._shader = shader
         self._plan = plan
         self._frame = frame
-        self._padded = plan.padded_region.inside(Region(0, 0, plan.width, plan.height))
-        self._edge = np.zeros((plan.padded_region.height, plan.padded_region.width), bool)
+        self._edge = np.zeros((plan.height, plan.width), bool)
         self.layers: dict[str, np.ndarray] = {}
         self.error: ErrorEstimate | None = None
         self.rounds: Sequence[Round] = ()
@@ -56,10 +54,9 @@ class Passes:
     def run(self) -> None:
         """Run the passes of the plan."""
         exposed: FilmAccumulator | None = None
-        padded = self._plan.padded_region
         for step in self._plan.passes:
             if isinstance(step, Edges | Blur):
-                pixels = padded.width * padded.height
+                pixels = self._plan.width * self._plan.height
                 with self._job.stage(step.name, pixels, step.message) as advance:
                     if isinstance(step, Edges):
                         self._detect(step.detector, advance)
@@ -93,19 +90,13 @@ class Passes:
         """Trace samples of a lattice: their means are new layers or, at edges, are averaged with these."""
         plan = self._plan
         phase = self._frame / plan.time_strata if plan.frames > 1 else step.pattern.phase
-        pattern = replace(step.pattern, seed=self._seed_of(step), phase=phase)
-        padded = plan.padded_region
-        width = plan.width
-        count = padded.width * padded.height
-        pixels: Any = range(padded.y * width, (padded.y + padded.height) * width)
+        pattern = replace(step.pattern, phase=phase)
+        count = plan.width * plan.height
         edge = np.flatnonzero(self._edge).astype(np.uint32) if isinstance(step, Refinement) else None
-        if edge is not None or padded.width != width:
-            inside = np.arange(count, dtype=np.uint32) if edge is None else edge
-            row, column = np.divmod(inside, np.uint32(padded.width))
-            pixels = (row + np.uint32(padded.y)) * np.uint32(width) + column + np.uint32(padded.x)
+        pixels = range(count) if edge is None else edge
         layers = {name: self._layer(name).reshape(count, -1) for name in exposer.planes}
         with self._job.stage(step.name, len(pixels), step.message) as advance:
-            exposer.average(pattern, pattern.seed, pixels, layers, edge, advance)
+            exposer.average(pattern, self._seed_of(step), pixels, layers, edge, advance)
         if "image" in step.layers:
             self._count(pattern.size, ... if edge is None else self._edge, anew=pattern.first == 0)
         if "square" in step.layers:
@@ -113,13 +104,12 @@ class Passes:
             self.layers["variance"] = _variance_of_mean(square, self.layers["image"], pattern.size)
 
     def _expose(self, step: Pass, exposer: Exposer, before: FilmAccumulator | None) -> FilmAccumulator:
-        """Expose the padded region of a film or, after an exposure, the pixels at edges in addition."""
+        """Expose a film or, after an exposure, the pixels at edges in addition."""
         film = exposer.film
-        plan = self._plan
         rays = film.rays_near(step.pattern.size)
         edge: Any = ... if before is None else self._edge
-        marked = np.zeros((plan.height, plan.width), bool)
-        marked[self._padded][edge] = True
+        marked = np.zeros_like(self._edge)
+        marked[edge] = True
         chosen = np.pad(marked, film.border).reshape(1, -1)
         pixels = np.flatnonzero(widened(film, chosen)[0])
         samples = exposer.samples(step.pattern, self._seed_of(step))
@@ -132,7 +122,7 @@ class Passes:
         if moments:
             variance = _variance_of_mean(exposed.square[:, 0] / rays, exposed.total[:, 0] / rays, rays)
             variance *= film.filter_variance_ratio
-            self._layer("variance")[:] = film.picture(np.moveaxis(variance, 0, -1))[self._padded]
+            self._layer("variance")[:] = film.picture(np.moveaxis(variance, 0, -1))
         self._develop(exposer, accumulated.mean())
         return accumulated
 
@@ -168,18 +158,18 @@ class Passes:
         variance = pixel_variance(stats, blurred)
         error = pixel_error(stats, variance, blurred)
         with np.errstate(over="ignore"):  # errors beyond float32
-            self._layer("variance")[:] = variance[self._padded]
-            self._layer("error")[..., 0] = error[self._padded]
-        self._layer("samples")[..., 0] = stats.samples()[self._padded]
+            self._layer("variance")[:] = variance
+            self._layer("error")[..., 0] = error
+        self._layer("samples")[..., 0] = stats.samples()
         if denoiser and denoiser.left_out and finished.denoised is None:
             self.left_out = ("denoising", denoiser.left_out)
         if step.goal.denoise:
             denoised = finished.denoised
             self._layer("noisy")[:] = self._layer("image")
             if denoised is not None:
-                self._layer("image")[:] = denoised.image[self._padded]
-                self._layer("denoised")[..., 0] = denoised.weight[self._padded]
-                self._layer("error")[..., 0] = denoised.error[self._padded]
+                self._layer("image")[:] = denoised.image
+                self._layer("denoised")[..., 0] = denoised.weight
+                self._layer("error")[..., 0] = denoised.error
             else:
                 self._layer("denoised")[:] = 0
 
@@ -194,7 +184,6 @@ class Passes:
 
     def _develop(self, exposer: Exposer, picture: np.ndarray) -> None:
         """Write an exposed picture [H, W, channels] into layers."""
-        picture = picture[self._padded]
         self._layer("image")[:] = picture[..., :3]
         for number, name in enumerate(exposer.film_channels[3:], 3):
             self.layers[FILM_PREFIX + name] = picture[..., number, None].astype(np.float32)
@@ -229,7 +218,7 @@ class Passes:
         for rows, wide, inner in self._bands(dof.REACH):
             sharp = image[rows.start : wide.stop]
             sharp = np.concatenate([above, sharp]) if len(above) else sharp
-            blurred = filters.gaussian_dof(sharp, depth[wide], mode=step.mode, **focus)
+            blurred = filters.gaussian_dof(sharp, depth[wide], **focus)
             above = sharp[: inner.stop][-dof.REACH :].copy()
             image[rows] = blurred[inner]
             if amount is not None:
@@ -248,8 +237,7 @@ class Passes:
         A filter that reads only some rows above and below a pixel, its halo, gives the same bits for a band
         with its halo as for the whole picture.
         """
-        height = self._plan.padded_region.height
-        width = self._plan.padded_region.width
+        height, width = self._edge.shape
         most = self._job.workspace.band_rows(width)
         step = height if height <= most else max(most - 2 * halo, halo, 1)
         for start in range(0, height, step):
@@ -261,7 +249,7 @@ class Passes:
     def _layer(self, name: str) -> np.ndarray:
         """Return a layer, of zeros if it is new; all but the picture in planes, as an EXR has them."""
         if name not in self.layers:
-            shape = self._plan.padded_region.height, self._plan.padded_region.width
+            shape = self._edge.shape
             channels = len(TABLE[name].letters)
             planes = np.zeros((*shape, channels) if name == "image" else (channels, *shape), np.float32)
             self.layers[name] = planes if name == "image" else np.moveaxis(planes, 0, -1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import importlib
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -16,10 +15,9 @@ from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
 from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import UsageError, needs_extra
 from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
-from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.plugins.whitted import plan as kernel_plan
 from mrt_mitsuba.plugins.whitted.plan import KernelPlan, SceneFacts
-from mrt_mitsuba.rendering.film import Film, Region, SamplePattern
+from mrt_mitsuba.rendering.film import Film, SamplePattern
 from mrt_mitsuba.rendering.settings import (
     AA,
     AAMODE,
@@ -40,7 +38,7 @@ ROUND_CHANNELS = 240
 MOST_SPP = 65536  # that the option ``spp`` can hold
 
 # The options that a result names: those that shape a picture
-_NAMED = (*(name for name in OPTIONS if name != "memory"), "params", "region", "integrator")
+_NAMED = (*(name for name in OPTIONS if name != "memory"), "params", "integrator")
 
 
 # ---------------------------------- Passes over the picture -----------------------------------
@@ -145,12 +143,11 @@ class Blur(Pass):
     name = "depth of field"
     message = "Computing depth of field.."  # as the original program prints it
     gives = frozenset({"depth"})
-    mode: str  #: "report" or "corrected"
     focal_distance: float  #: that is sharp, from the camera in units of the scene
     focal_range: float  #: half-width of the sharp zone around it
 
     def __str__(self) -> str:
-        return f"depth of field: {self.mode}"
+        return "depth of field"
 
 
 # ----------------------------------------- The plan -------------------------------------------
@@ -170,10 +167,7 @@ class Plan:
     bands: tuple[str, ...]  #: spectral ones of the film
     kernel: KernelPlan | None  #: what the tracing kernels hold; None where the integrator does not say
     facts: SceneFacts | None  #: what the kernels depend on
-    region: Region  #: that is returned
-    padded_region: Region  #: with the pixels around it that filters read
     channels: int  #: float32 ones kept for every pixel: the picture, its layers, and the detector's
-    motion: str | None  #: "frames", "stratified", "film", or None where the camera stands still
     time_strata: int  #: while the shutter is open; 0 where the camera stands still
     frames: int  #: pictures to average, each with filters of its own
     seed: int  #: of all random numbers
@@ -195,15 +189,8 @@ class Plan:
 
     def __str__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]
-        part = self.region
-        if (part.width, part.height) != (self.width, self.height):
-            lines += [f"  region  {part.width}x{part.height} from column {part.x}, row {part.y}"]
-        if self.motion:
-            moments = f"{self.time_strata} frames"
-            if self.motion == FILM:
-                moments = "each ray at its own moment"
-            elif self.motion == "stratified":
-                moments = f"at least {self.time_strata} moments in a pixel"
+        if self.time_strata:
+            moments = "each ray at its own moment" if self.film else f"{self.time_strata} frames"
             lines += [f"  pass    motion blur: {moments}"]
         lines += [f"  pass    {step}" for step in self.passes]
         if self.film:
@@ -231,20 +218,17 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
     """
     goal = settings.goal(source.goal)
     decided = _decided(settings, goal, source, shader)
-    _check(settings, decided, goal, source, shader)
+    _check(settings, decided, goal, shader)
     film = shader.film
     on_film = decided.lattice == FILM
     asked, possible = _layers(decided, goal, shader)
     traced = _traced(asked & shader.layers, decided, shader)
     passes = tuple(_passes(traced, decided, goal, shader))
     returned = asked.union(*(step.gives & possible for step in passes))
-    region = Region(*(decided.region or (0, 0, source.width, source.height)))
-    reach = edges.REACH * bool(_detector(decided)) + dof.REACH * bool(decided.focaldist)
     channels = sum(len(TABLE[name].letters) for name in traced | returned)
     if on_film:  # sums by pixel, in double precision, while a film is exposed
         channels += ROUND_CHANNELS if goal else FILM_CHANNELS
         channels += OWN_CHANNELS * len(film.bands + shader.aovs)
-    motion = decided.motionmode if decided.motion else None
     return Plan(
         scene=source.name,
         variant=str(mi.variant()),
@@ -256,10 +240,7 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
         bands=film.bands,
         kernel=shader.kernel,
         facts=shader.facts,
-        region=region,
-        padded_region=region.grown(reach, source.width, source.height),
         channels=channels,
-        motion=FILM if motion and on_film else motion,
         time_strata=_strata(decided),
         frames=_frames(decided),
         seed=decided.seed,
@@ -316,7 +297,7 @@ def _strata(settings: RenderSettings) -> int:
 def _frames(settings: RenderSettings) -> int:
     """Return how many pictures are rendered, filtered and averaged."""
     filtered = _detector(settings) or settings.focaldist
-    if settings.motion and settings.motionmode == "frames" and settings.lattice != FILM and filtered:
+    if settings.motion and settings.lattice != FILM and filtered:
         return settings.motionsamples
     return 1
 
@@ -354,9 +335,7 @@ def _traced(asked: frozenset[str], settings: RenderSettings, shader: Shader) -> 
     return frozenset(traced)
 
 
-def _check(
-    given: RenderSettings, decided: RenderSettings, goal: Goal | None, source: Source, shader: Shader
-) -> None:
+def _check(given: RenderSettings, decided: RenderSettings, goal: Goal | None, shader: Shader) -> None:
     """Raise ``UsageError`` for options that do not go together."""
     if goal is None:
         only = "{0} is of use only with adaptive sampling: with target or aamode=noise"
@@ -370,7 +349,7 @@ def _check(
         )
         if given.error is not None:
             _refuse(given, ("aamode", "spp"), (NOISE,), both)
-        _refuse(given, ("aa", "lattice", "region"), (FILM,), both)
+        _refuse(given, ("aa", "lattice"), (FILM,), both)
         if goal.denoise:
             if decided.focaldist:
                 raise UsageError("denoise with depth of field as a filter: write focaldist=0")
@@ -389,10 +368,6 @@ def _check(
             raise UsageError(
                 f"focaldist={decided.focaldist}: {alone}; write focaldist=0, or choose another, such as path"
             )
-    x, y, width, height = given.region or (0, 0, 1, 1)
-    if x + width > source.width or y + height > source.height:
-        size = f"{source.width}x{source.height} pixels"
-        raise UsageError(f"region={given.region}: it exceeds the picture, {size}")
 
 
 def _refuse(settings: RenderSettings, options: Sequence[str], allowed: Sequence[Any], text: str) -> None:
@@ -461,31 +436,24 @@ def _passes(
             yield Refinement(layers=traced - at_centre - {"square"}, pattern=_samples(settings, first))
     if settings.focaldist and settings.focalrange is not None:
         focus: dict[str, Any] = {"focal_distance": settings.focaldist, "focal_range": settings.focalrange}
-        yield Blur(mode=settings.dof, **focus)
+        yield Blur(**focus)
 
 
 def _samples(settings: RenderSettings, first: int = 0) -> SamplePattern:
     """Return the samples of a pixel from number ``first`` on."""
     aa = settings.aa or AA
     repeats = settings.spp or 1
-    strata = _strata(settings)
-    lattice: dict[str, Any] = {"lattice": settings.lattice, "aa": aa, "first": first}
-    lattice["count"] = count = aa**2 - first
-    stratified = settings.motionmode == "stratified"
-    if settings.lattice == FILM:  # each ray has a time of its own
-        wanted = math.ceil(strata / aa**2) if stratified else repeats * strata
-        return SamplePattern(**lattice, repeats=max(repeats, wanted))
-    if strata and stratified:  # every ray of a pixel in a stratum of its own
-        rays = repeats * math.ceil(strata / (count * repeats))
-        return SamplePattern(**lattice, repeats=rays, time_strata=count * rays, phase=None)
-    return replace(_centre(settings), **lattice)
+    if settings.lattice == FILM:
+        repeats *= max(_strata(settings), 1)  # each ray has a time of its own
+        return SamplePattern(FILM, aa, first, aa**2 - first, repeats)
+    pattern = _centre(settings)
+    return replace(pattern, lattice=settings.lattice, aa=aa, first=first, count=aa**2 - first)
 
 
 def _centre(settings: RenderSettings) -> SamplePattern:
     """Return the pixel's centre alone, at the same times in every pixel."""
     strata = _strata(settings) if _frames(settings) == 1 else 1
-    phase = 0.5 if settings.motionmode == "stratified" else 0.0
-    return SamplePattern(repeats=(settings.spp or 1) * max(strata, 1), time_strata=strata, phase=phase)
+    return SamplePattern(repeats=(settings.spp or 1) * max(strata, 1), time_strata=strata)
 
 
 def _left_out(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,12 +17,9 @@ from mrt_mitsuba.plugins.whitted.snapshot import SnapshotPart
 from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
 from mrt_mitsuba.rendering.exposing import Exposer
 from mrt_mitsuba.rendering.film import Film
-from mrt_mitsuba.rendering.settings import RenderOptions, RenderSettings
+from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import opened
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class Prepared:
@@ -37,9 +34,9 @@ class Prepared:
     _exposer: Any = None  # whose kernels are recorded
     _launch: Any = None  # what launches them; None where nothing is recorded
 
-    def __init__(self, scene: Any, options: RenderOptions) -> None:
+    def __init__(self, scene: object, settings: RenderSettings) -> None:
         self._scene = scene
-        self._settings = RenderSettings.of(**options)
+        self._settings = settings
         with runtime.render_lock.lock, defer_signals():
             self._render(self._settings.seed)
             self._film_window = _window(self._source.sensor.film())
@@ -112,9 +109,8 @@ class Prepared:
             and (window[2:4] != size or window[:2] == size)  # else only a part of its film is seen
         )
         alone = len(plan.passes) == 1 and first.layers == {"image"} and first.pattern.size == 1
-        whole = plan.region == plan.padded_region == (0, 0, *size)
         traced = plan.kernel is not None and plan.variant == "llvm_ad_rgb"
-        if not (plain and alone and whole and traced) or plan.layers or plan.motion:
+        if not (plain and alone and traced) or plan.layers or plan.time_strata:
             return
         # A camera of its own, of the size of the picture
         clip = {"near_clip": sensor.near_clip(), "far_clip": sensor.far_clip()}
@@ -160,7 +156,7 @@ def _window(film: mi.Film) -> tuple[int, ...]:
     return tuple(int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
 
 
-def prepare(scene: Any = 0, **options: Unpack[RenderOptions]) -> Prepared:
+def prepare(scene: object = 0, **options: object) -> Prepared:
     """Read a scene and record its kernels once, for many renders of it; ``options`` are those of ``render``.
 
     .. code-block:: python
@@ -172,4 +168,4 @@ def prepare(scene: Any = 0, **options: Unpack[RenderOptions]) -> Prepared:
     Kernels that trace more than one ray a pixel, that call plugins, or that filters follow, are not recorded
     but run as ``render`` does.
     """
-    return Prepared(scene, options)
+    return Prepared(scene, RenderSettings.of(**options))

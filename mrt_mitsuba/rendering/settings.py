@@ -1,16 +1,16 @@
 """The options of ``mrt.render``: ``RenderSettings`` holds and checks them, also for the command, which adds
-its own; ``RenderOptions`` has their types for editors.
+its own.
 
-A new option is a field, a type in ``RenderOptions`` and a parameter of ``render``.
+A new option is a field here and a parameter of ``render``.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Any, Literal
 
 from mrt_mitsuba.adaptive.target import METRIC_NAMES, Goal, Target
 from mrt_mitsuba.errors import UsageError
@@ -23,7 +23,6 @@ from mrt_mitsuba.options import (
     NAME,
     NUMBER,
     PARAMETERS,
-    RECTANGLE,
     SWITCH,
     TARGET,
     VECTOR,
@@ -54,51 +53,6 @@ NOISE = "noise"  # the aamode that allocates samples by variance
 MIN_SPP = 16  # samples per pixel from which the variance is estimated
 MAX_SPP = 4096  # mean samples per pixel, where a target alone would ask for more
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
-
-
-class SharedOptions(TypedDict, total=False):
-    """The options of ``render`` that each render of a sweep may have, for type checkers."""
-
-    width: int | None
-    height: int | None
-    aa: int | None
-    aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None
-    target: Target | float | str | Sequence[float] | None
-    metric: Literal["linear", "relative", "display"] | None
-    denoise: bool
-    maxspp: int | None
-    maxseconds: float | None
-    lattice: Lattice | None
-    fresnel: Literal["schlick", "dielectric"] | None
-    focaldist: float | None
-    focalrange: float | None
-    dof: Literal["report", "corrected"]
-    layers: Sequence[str] | str
-    motion: Sequence[float] | None
-    motionsamples: int
-    motionmode: Literal["frames", "stratified"]
-    convention: Convention
-    texturing: Convention | None
-    camera: Sequence[float] | None
-    up: Sequence[float] | None
-    fov: float | None
-    light: Sequence[float] | None
-    variant: str | None
-    memory: int | str | None
-    seed: int
-    integrator: Any
-    sensor: int
-    on_round: Callable[[RoundPicture], object] | None
-    spp: int | None
-    count_rays: bool
-    params: Mapping[str, Any] | None
-    region: Sequence[int] | None
-
-
-class RenderOptions(SharedOptions, total=False):
-    """The options of ``render`` as type checkers see them where a function takes ``**options``."""
-
-    progress: Progress | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,9 +107,6 @@ class RenderSettings:
     focalrange: float | None = option(
         None, NUMBER, "half-width of the sharp zone around it", "from the scene"
     )
-    dof: str = option(
-        "report", choice("report", "corrected"), "depth of field as in the report, or without its flaws"
-    )
     layers: tuple[str, ...] = option(
         (), subset(LAYERS), f"more EXR layers: all, or some of {', '.join(LAYERS)}", "none"
     )
@@ -164,12 +115,6 @@ class RenderSettings:
     )
     motionsamples: int = option(
         16, integer(1, 65536), "moments at which motion blur sees the scene", needs="motion"
-    )
-    motionmode: str = option(
-        "frames",
-        choice("frames", "stratified"),
-        "motion blur: a render for each moment, or one for all",
-        needs="motion",
     )
     convention: str = option("report", CONVENTION, "MTL files: Ni is the roughness, or the IOR")
     texturing: str | None = option(
@@ -212,9 +157,6 @@ class RenderSettings:
     params: dict[str, Any] | None = option(
         None, PARAMETERS, "values for the $names that an XML file declares, and by keys of mi.traverse"
     )
-    region: tuple[int, ...] | None = option(
-        None, RECTANGLE, "column, row, width and height of the pixels to return, as in the whole picture"
-    )
     progress: Progress | None = option(
         None,
         instance(Progress, "a rendering.progress.Progress"),
@@ -229,14 +171,14 @@ class RenderSettings:
         self.model()  # checks what shows nothing
 
     @classmethod
-    def of(cls, **options: Any) -> RenderSettings:
+    def of(cls, **options: object) -> RenderSettings:
         """Make settings of the options that a user gives; raise ``TypeError`` for an unknown one."""
         for name in options.keys() - cls.__dataclass_fields__.keys():
             close = difflib.get_close_matches(name, cls.__dataclass_fields__, 1)
             raise TypeError(
                 f"{name!r} is not an option of render" + "".join(f": did you mean {c}?" for c in close)
             )
-        return cls(**options)
+        return cls(**options)  # type: ignore[arg-type]  # which ``__post_init__`` checks
 
     @property
     def error(self) -> Target | None:

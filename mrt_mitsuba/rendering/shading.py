@@ -16,7 +16,6 @@ from mrt_mitsuba.plugins import is_known, plugin
 from mrt_mitsuba.plugins.parameters import ParameterError
 from mrt_mitsuba.plugins.variants import text_of
 from mrt_mitsuba.plugins.whitted.plan import KernelPlan, SceneFacts
-from mrt_mitsuba.plugins.whitted.tables import ByShape
 from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.scene.open import Source
 
@@ -86,27 +85,6 @@ class RayValues:
         # not si.t: rays start at the near plane
         eye = mi.Point3f(sensor.world_transform().translation()) + self.shader.shift(self.si.time)
         return dr.norm(self.si.p - eye)
-
-    @property
-    def shape(self) -> mi.Float:
-        """Number of the scene's shape that is hit first, from 1; 0 for a miss."""
-        hit = mi.SurfaceInteraction3f(self.si)
-        shapes = self.shader.scene.shapes()
-        if mi.variant().startswith("scalar"):
-            hit.shape = hit.instance or hit.shape
-        else:
-            hit.shape = dr.select(hit.instance != None, hit.instance, hit.shape)  # noqa: E711 - lane by lane
-        return ByShape(mi.Float, shapes, range(1, len(shapes) + 1), 0.0)(hit, self.found)
-
-    @property
-    def material(self) -> mi.Float:
-        """Number of the material that is hit first, from 1 in the order of the shapes; 0 for a miss, and in
-        an instance."""
-        shapes = self.shader.scene.shapes()
-        numbers = dict[int, int]()
-        materials = [shape.bsdf() for shape in shapes]  # kept, so that each has an id of its own
-        rows = [numbers.setdefault(id(material), len(numbers) + 1) for material in materials]
-        return ByShape(mi.Float, shapes, rows, 0.0)(self.si, self.found)
 
     @property
     def albedo(self) -> mi.Color3f:

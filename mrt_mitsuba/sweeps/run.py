@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import ExitStack, closing
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mrt_mitsuba import runtime, user_plugins
 from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
@@ -16,11 +16,6 @@ from mrt_mitsuba.sweeps.jobs import check_parameters, jobs, points
 from mrt_mitsuba.sweeps.pictures import is_fresh
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.worker import describe
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from mrt_mitsuba.rendering.settings import SharedOptions
 
 
 def sweep(
@@ -37,7 +32,7 @@ def sweep(
     plugins: Any = (),
     dashboard: int | None = None,
     progress: Progress | None = None,
-    **options: Unpack[SharedOptions],
+    **options: object,
 ) -> Table:
     """Render every combination of a grid's values on several processes or machines.
 

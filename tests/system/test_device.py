@@ -25,7 +25,7 @@ def different(a: np.ndarray, b: np.ndarray) -> float:
 
 
 LAYERS = {"layers": ["depth", "bounces"]}
-MOVING = {"motion": (0.3, 0.1, 0.4), "motionsamples": 4, "motionmode": "stratified"}
+MOVING = {"motion": (0.3, 0.1, 0.4), "motionsamples": 4}
 
 
 @pytest.mark.parametrize(

@@ -25,40 +25,25 @@ def way(**options: object) -> None:
 
 
 way(aamode="none", **FOCUS, layers=LAYERS)
-way(aamode="luma", **FOCUS, layers=FOUND, dof="corrected", lattice="centered")
+way(aamode="luma", **FOCUS, layers=FOUND, lattice="centered")
 way(aamode="sobel", **FOCUS, layers=FOUND)
-way(aamode="geometry", **FOCUS, layers=FOUND, dof="corrected", lattice="centered")
+way(aamode="geometry", **FOCUS, layers=FOUND, lattice="centered")
 way(aamode="none", integrator="path", spp=2, focaldist=2.0, seed=5)
 way(aamode="sobel", integrator="path", spp=2, focaldist=2.0, seed=5)
 way(aamode="sobel", focaldist=0, layers=["samples"])
 way(aamode="sobel", lattice="film")
 way(aamode="noise", spp=16, aa=None)
 way(motion=(0.2, 0, 0.1), motionsamples=3, layers=["albedo"])
-way(motion=(0.2, 0, 0.1), motionsamples=3, motionmode="stratified")
-
-
-# Columns and rows of tiles: narrower than what filters look at, in the middle, and the rest
-TILES = [(x, y, w, h) for x, w in ((0, 5), (5, 55), (60, 71)) for y, h in ((0, 40), (40, 7), (47, 50))]
-
-
-def assert_inside(part: mrt.Result, whole: mrt.Result, region: tuple[int, int, int, int]) -> None:
-    x, y, width, height = region
-    inside = slice(y, y + height), slice(x, x + width)
-    assert part.layers.keys() == whole.layers.keys()
-    assert part.image.tobytes() == whole.image[inside].tobytes(), region
-    for name, values in part.layers.items():
-        assert values.tobytes() == whole.layers[name][inside].tobytes(), (name, region)
 
 
 @pytest.mark.parametrize("options", ways, ids=str)
-def test_parts_threads_and_regions_change_no_bit(monkeypatch, options):
+def test_parts_and_threads_change_no_bit(monkeypatch, options):
     scene = mrt.scene_dict(3, **SIZE) if "integrator" in options else 3
     options = {**({} if "integrator" in options else SIZE), "aa": 2, "count_rays": True, **options}
     whole = mrt.render(scene, **options)
     threads = dr.thread_count()
     monkeypatch.setattr(machine, "MAX_BAND", 41 * SIZE["width"])  # of a part of a filter
     monkeypatch.setattr(machine, "MAX_WAVEFRONT", 9_011)
-    tiles = TILES if options["aa"] and options.get("lattice") != "film" else []  # a filter may be wide
     dr.set_thread_count(1)
     try:
         parts = mrt.render(scene, **options)
@@ -66,19 +51,10 @@ def test_parts_threads_and_regions_change_no_bit(monkeypatch, options):
         dr.set_thread_count(threads)
     assert parts.kernel_launches > whole.kernel_launches
     assert dict(parts.rays) == dict(whole.rays)
-    assert_inside(parts, whole, (0, 0, *SIZE.values()))
-    for in_parts in (True, False):
-        for region in tiles[4:5] if in_parts else tiles:
-            part = mrt.render(scene, region=region, **options)
-            assert part.options["region"] == region
-            assert_inside(part, whole, region)
-        monkeypatch.undo()
-
-
-@pytest.mark.parametrize("region", [(0, 0, 132, 1), (0, 97, 1, 1), (-1, 0, 5, 5), (0, 0, 0, 1), (1, 2), 3])
-def test_regions_outside_are_refused(region):
-    with pytest.raises(mrt.UsageError, match="region="):
-        mrt.render(3, region=region, **SIZE)
+    assert parts.image.tobytes() == whole.image.tobytes()
+    assert parts.layers.keys() == whole.layers.keys()
+    for name, values in parts.layers.items():
+        assert values.tobytes() == whole.layers[name].tobytes(), name
 
 
 PEAK = """
@@ -105,7 +81,7 @@ print(json.dumps(found))
 
 
 REPORT = """
-    result = mrt.render(3, width=size, height=size, aa=2, aamode="sobel", dof="report", memory=memory)
+    result = mrt.render(3, width=size, height=size, aa=2, aamode="sobel", memory=memory)
     result.save("a.png")
     result.save("a.exr")"""
 FILM = """

@@ -407,22 +407,6 @@ def test_what_does_not_go_together(options, text):
         mrt.render(_load("spot"), **options)
 
 
-def test_every_pixel_has_its_place_shape_and_material():
-    layers = ["position", "uv", "shape", "material", "depth"]
-    found = mrt.render(_load("gloss"), spp=1, layers=layers).layers
-    ball = found["shape.I"][HEIGHT // 2, WIDTH // 2]
-    floor = found["shape.I"][-1, 0]
-    assert ball != floor
-    assert found["material.I"][-1, 0] != found["material.I"][HEIGHT // 2, WIDTH // 2]
-    assert found["shape.I"][0, 0] == 0
-    assert math.isinf(found["depth.Z"][0, 0])
-    place = np.array([found[f"position.{axis}"][-1, 0] for axis in "XYZ"])
-    assert place[1] == pytest.approx(0, abs=1e-4)
-    assert found["depth.Z"][-1, 0] == pytest.approx(np.linalg.norm(place - [0, 1.5, 5]), rel=1e-4)
-    assert found["uv.U"].min() >= 0
-    assert found["uv.V"].max() <= 1
-
-
 @pytest.mark.parametrize(
     ("kind", "rfilter", "size"),
     [

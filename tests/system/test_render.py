@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cases import Cases
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.files import LAYERS
@@ -61,12 +61,6 @@ def test_slow_variants_are_warned_of_once_in_a_process(run_python):
     render = 'mrt.render(0, width=2, height=1, aa=1, variant="scalar_rgb")'
     done = run_python(f"import mrt_mitsuba as mrt\n{render}\n{render}")
     assert done.stderr.count("one ray at a time") == 1
-
-
-def test_a_region_in_a_scalar_variant():
-    options = {"width": 12, "height": 9, "aa": 2, "focalrange": 0.5, "variant": "scalar_rgb"}
-    whole = mrt.render(3, **options).image
-    assert_array_equal(mrt.render(3, region=(3, 4, 7, 3), **options).image, whole[4:7, 3:10])
 
 
 def test_scene_numbers_dicts_and_mitsuba_scenes_agree():

@@ -120,15 +120,11 @@ def test_values_that_are_not_finite_spoil_no_error(options, rfilter, bad):
         assert error.high >= error.rmse
 
 
-@pytest.mark.parametrize("region", [None, (3, 3, 4, 4)])
-def test_light_beyond_float32_is_infinite_where_it_is_seen(region):
+def test_light_beyond_float32_is_infinite_where_it_is_seen():
     """In pixels around the picture, too, whose rays weigh nothing there: infinity times 0 is no number."""
     look = sensor([0, 0, 1], [0, 0, 0], (12, 9), rfilter="gaussian")
     look["film"]["sample_border"] = True
     light = {"type": "constant", "radiance": {"type": "rgb", "value": 3e38}}
-    result = mrt.render(
-        {"type": "scene", "sensor": look, "light": light}, integrator="path", spp=4, region=region
-    )
+    result = mrt.render({"type": "scene", "sensor": look, "light": light}, integrator="path", spp=4)
     assert np.isposinf(result.image).all()
-    across, down = (region or (0, 0, 12, 9))[2:]
-    assert result.rays["primary"] == 4 * (across + 4) * (down + 4)  # those that the filter reaches from
+    assert result.rays["primary"] == 4 * (12 + 4) * (9 + 4)  # those that the filter reaches from

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from cases import Cases
-from hypothesis import Phase, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from mrt_mitsuba import UsageError, filters, runtime
+from mrt_mitsuba import UsageError, runtime
 from mrt_mitsuba.filters import (
     blur_amount,
-    edges_image,
     gaussian_dof,
     geometry_edges,
     luma_edges,
@@ -189,7 +188,6 @@ def test_geometry_sees_a_step_in_every_direction():
     assert_array_equal(geometry_edges(normal, depth).mask, around)
 
 
-MODES = ["report", "corrected"]
 SIXTEENTH = st.integers(0, 16 * 14).map(lambda n: n / 16)  # exact in float32, as are all amounts made of them
 SMALL_SIZES = st.tuples(st.integers(1, 30), st.integers(1, 20))
 SEEDS = st.integers(0, 2**32 - 1)
@@ -234,25 +232,12 @@ def test_report_equals_the_loops(backend, size, seed, focus):
     assert_array_equal(found[amount < 1], image[amount < 1])
 
 
-@ANY_PICTURE
-@settings(max_examples=12, phases=[Phase.explicit, Phase.generate])  # to shrink takes minutes of loops
-def test_corrected_equals_the_loops(size, seed, focus):
-    """Discs of all sizes on both sides of the focus, layers near and far apart, borders."""
-    image, depth = scene(size, seed)
-    radius = reference.disc_radius(reference.blur_amount(depth, **focus))
-    radius[(depth > 0) & (depth < focus["focal_distance"])] *= -1
-    # float32 sums of up to 81 terms, and quotients of them
-    found = gaussian_dof(image, depth, mode="corrected", **focus)
-    assert_allclose(found, reference.corrected_dof(image, radius), atol=5e-6)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_a_bad_colour_gives_nothing(mode):
+def test_a_bad_colour_gives_nothing():
     image = np.full((25, 30, 3), 0.75)
     image[12, 15, 2] = image[3, 0, 0] = np.nan
     good = np.isfinite(image).all(axis=-1)
     for amount in (np.full((25, 30), 8.0), np.arange(750.0).reshape(25, 30) % 9):
-        found = gaussian_dof(image, 1 + amount, focal_distance=1.0, focal_range=0, mode=mode)
+        found = gaussian_dof(image, 1 + amount, focal_distance=1.0, focal_range=0)
         # the weights of what is left add up to one, but for the rounding of their sums of 61 terms at most
         assert_allclose(found[good], 0.75, rtol=61 * 6e-8)
 
@@ -269,44 +254,24 @@ def test_arrays_give_arrays_of_their_kind(backend):
     assert type(found.mask) is module.TensorXb
     assert type(found.value) is module.TensorXf
     assert_array_equal(listed.mask, plain.mask)
-    for mode in MODES:
-        given_image = tensor(backend, image)
-        options = {"focal_distance": 3.0, "focal_range": 0.5, "mode": mode}
-        blurred = gaussian_dof(image, depth, **options)
-        first = gaussian_dof(given_image, depth, **options)
-        second = gaussian_dof(given_image, depth, **options)
-        assert isinstance(blurred, np.ndarray)
-        assert blurred.dtype == np.float32
-        assert type(first) is module.TensorXf
-        assert first.shape == (40, 50, 3)
-        assert_array_equal(np.array(first), np.array(second))
-        # the same operations in the same order, but for fused multiply-adds: a rounding for each term
-        assert_allclose(np.array(first), blurred, atol=61 * 6e-8)
-        assert_array_equal(np.array(given_image), image)
-
-
-def test_contours_stand_side_by_side_in_white_on_black():
-    image = np.zeros((8, 12, 3), np.float32)
-    image[:, 6:] = 1
-    luma = luma_edges(image, contrast_offset=0)
-    sobel = sobel_edges(image)
-    sheet = filters.contours(luma, sobel)
-    assert sheet.shape == (8, 2 * 12 + 4, 3)
-    assert sheet.dtype == np.float32
-    assert (sheet[:, 12:16] == 0.5).all()
-    for edges, part in ((luma, sheet[:, :12]), (sobel, sheet[:, 16:])):
-        assert edges.mask[3, 5]
-        assert edges.mask[3, 6]
-        assert not edges.mask[3, 3]
-        for channel in (edges_image(edges), *np.moveaxis(part, -1, 0)):
-            assert_array_equal(channel, edges.mask)
+    given_image = tensor(backend, image)
+    options = {"focal_distance": 3.0, "focal_range": 0.5}
+    blurred = gaussian_dof(image, depth, **options)
+    first = gaussian_dof(given_image, depth, **options)
+    second = gaussian_dof(given_image, depth, **options)
+    assert isinstance(blurred, np.ndarray)
+    assert blurred.dtype == np.float32
+    assert type(first) is module.TensorXf
+    assert first.shape == (40, 50, 3)
+    assert_array_equal(np.array(first), np.array(second))
+    # the same operations in the same order, but for fused multiply-adds: a rounding for each term
+    assert_allclose(np.array(first), blurred, atol=61 * 6e-8)
+    assert_array_equal(np.array(given_image), image)
 
 
 IMAGE = np.zeros((4, 5, 3))
 DEPTH = np.zeros((4, 5))
 SHAPES = [(), (4, 5), (4, 5, 4), (3, 4, 5, 3), (0, 5, 3)]
-
-
 wrong = Cases()
 for find in DETECTORS:
     for shape in SHAPES:
@@ -316,12 +281,9 @@ wrong(partial(sobel_edges, IMAGE, variance=IMAGE, noise_sigmas=-1), "noise_sigma
 wrong(partial(sobel_edges, IMAGE, threshold=np.nan), "threshold is not a number")
 wrong(partial(geometry_edges, IMAGE, DEPTH[:2]), "depth has shape")
 wrong(partial(geometry_edges, IMAGE, DEPTH, crease_angle=0), "crease_angle=0")
-wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, mode="lens"), "use one of report, cor")
 wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=np.nan), "focal_distance is not a number")
 wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, focal_range=np.nan), "focal_range is not a")
 wrong(partial(gaussian_dof, IMAGE, DEPTH.T, focal_distance=1), r"shape \(5, 4\); expected \[4, 5\]")
-wrong(filters.contours, r"at least one; given: \[\]")
-wrong(lambda: filters.contours(sobel_edges(IMAGE), sobel_edges(IMAGE[1:])), r"one height.*\[3, 4\]")
 
 
 @pytest.mark.parametrize(("call", "message"), wrong)

@@ -60,46 +60,6 @@ def gaussian_dof(image: Array, amount: Array) -> Array:
     return result[::-1]
 
 
-def disc_radius(amount: Array) -> Array:
-    """The radii of the discs of the corrected blur."""
-    small = amount**2 / (8 - 4 * np.minimum(amount, 1) ** 2)
-    return np.where(amount < 1, small, np.sqrt(np.maximum(2 * amount - 23 / 16, 0)) - 0.5)
-
-
-def corrected_dof(image: Array, radius: Array) -> Array:
-    """Blur with discs of signed radii, negative before the focus; see ``mrt_mitsuba.filters.dof``.
-
-    A neighbour is in front, in the same layer and behind by parts that add up to one. What is in front, or
-    level, spreads over its own disc; what is behind is seen through the pixel's, and in the same layer only
-    through the narrower of both.
-    """
-    steps = np.arange(-5, 6)
-    radii = np.pad(radius, 5, mode="edge")
-    picture = np.pad(np.float64(image), ((5, 5), (5, 5), (0, 0)), mode="edge")
-    # the share of its light that a disc has in each pixel around it [H + 10, W + 10, 11, 11]
-    discs = np.clip(abs(radii)[..., None, None] + 1 - np.hypot(steps[:, None], steps), 0, 1)
-    discs /= discs.sum(axis=(-2, -1), keepdims=True)
-    result = np.empty_like(picture[5:-5, 5:-5])
-    for y, x in np.ndindex(radius.shape):
-        window = np.s_[y : y + 11, x : x + 11]
-        own_disc = discs[y + 5, x + 5]
-        their_disc = np.einsum("yxyx->yx", discs[window])
-        order = radii[window] - radius[y, x]
-        wider_behind = (order > 0) & (abs(radii[window]) > abs(radius[y, x]))
-        front = np.clip(-order, 0, 1) * their_disc
-        same = np.maximum(1 - abs(order), 0) * np.where(wider_behind, own_disc, their_disc)
-        behind = np.clip(order, 0, 1) * own_disc
-        hidden = min(front.sum(), 1)
-        solid = min(same.sum(), 1)
-        gap = min(1 - solid, behind.sum())
-        first, second, third = (
-            np.einsum("yx,yxc->c", weight, picture[window]) / max(weight.sum(), 1e-300)
-            for weight in (front, same, behind)
-        )
-        result[y, x] = hidden * first + (1 - hidden) * (solid * second + gap * third) / (solid + gap)
-    return result
-
-
 def _inside(mask: Array, value: Array, margin: Array) -> Edges:
     """A detector's result; the border, whose windows are not whole, is surely no edge."""
     inner = np.zeros(mask.shape, bool)
