@@ -140,7 +140,7 @@ def needs_lock(scene: mi.Scene, integrator: mi.Integrator) -> bool:
     """True if a render runs Python code of ours, and no third-party integrator that may wait for it."""
     if of_this_package(integrator):
         return True
-    if not plugins.any_constructed() or not isinstance(integrator, mi.Integrator):
+    if not plugins.any_loaded() or not isinstance(integrator, mi.Integrator):
         return False
     inside = mi.traverse(integrator).hierarchy  # aov renders with others
     if not all(plugins.is_known(each) for each in inside if isinstance(each, mi.Integrator)):
@@ -193,7 +193,7 @@ def update_under_lock(
     with render_lock.lock:
         updated = update(*args, **given)
         parameters = _argument(0, "self", args, given)
-        changed = dict(updated) if plugins.any_constructed() else {}
+        changed = dict(updated) if plugins.any_loaded() else {}
         # What contains an object whose own parameters were updated is updated, too
         for key, (_, _, node, _) in parameters.properties.items() if changed else ():
             if key.rsplit(".", 1)[-1] in changed.get(node, ()):
@@ -273,7 +273,7 @@ PATCHES.append(_loading("mi.load_file", "path", file_is_ours))
 )
 def refuse_light_tracing(render: Function, /, *args: object, **given: object) -> object:
     scene = _argument(1, "scene", args, given)
-    kind = plugins.plugin("light").MrtLight
+    kind = plugins.classes_of("mrt_light")
     names = {row.class_name: row.name for row in plugins.PLUGINS}
     for light in scene.emitters() if isinstance(scene, mi.Scene) else ():
         if isinstance(light, kind):

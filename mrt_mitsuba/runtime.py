@@ -15,9 +15,17 @@ from mrt_mitsuba.errors import UnknownVariantError, VariantError, warn
 from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.mitsuba_changes import render_lock
+from mrt_mitsuba.plugins import Plugin
 
 FAST = "llvm_ad_rgb"
 SLOW = "scalar_rgb"
+
+#: the plugins of adaptive sampling
+ADAPTIVE = (
+    Plugin("mrt_adaptive", "integrator", "MrtAdaptive", "integrator", "mrt_mitsuba.adaptive"),
+    Plugin("mrt_rays", "samplers", "RaySampler", "sampler", "mrt_mitsuba.adaptive"),
+    Plugin("mrt_sequence", "samplers", "PixelSequence", "sampler", "mrt_mitsuba.adaptive"),
+)
 
 _warned = False  # that variants are slow
 _used: str | None = None  # the variant that was made current last
@@ -57,7 +65,7 @@ def use(variant: str | None = None) -> str:
             mitsuba_changes.mitsuba_first()
             mitsuba_changes.apply_patches()
         plugins.register()
-        plugins.register_modules("mrt_mitsuba.adaptive", ["samplers", "integrator"])
+        plugins.register(ADAPTIVE)
         _used = variant
     return variant
 

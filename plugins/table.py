@@ -1,13 +1,13 @@
 """The plugins of this folder, a row each: whatever lists them takes them from here.
 
 Registration, the reasons of the kernel plan, messages, the pages of the documentation and the lists of tests
-come from this table. A new plugin is a module with its class, and a row.
+come from this table. A new plugin is a module with its class, and a row. The table imports none of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,11 @@ class Plugin:
     name: str  #: what follows "type" in dicts and XML
     module: str
     class_name: str
-    kind: str  #: what it is to Mitsuba: "bsdf", "emitter", "integrator", "shape" or "texture"
+    kind: str  #: what it is to Mitsuba: "bsdf", "emitter", "integrator", "sampler", "shape", "texture", ...
+    package: str = __package__  #: where the module lies
     #: parameters of a small example: those without defaults, and what lets every number show in tests; arrays
     #: stand for bitmaps
-    sample: Mapping[str, Any]
+    sample: Mapping[str, Any] = field(default_factory=dict)
     #: the table of the kernels of ``mrt_whitted`` that its numbers go into: "lights", "materials", "planes",
     #: "quadrics", or "" for none
     table: str = ""
@@ -36,7 +37,6 @@ PLUGINS = (
         module="bsdf",
         class_name="MrtBSDF",
         kind="bsdf",
-        sample={},
         table="materials",
     ),
     Plugin(
@@ -68,7 +68,6 @@ PLUGINS = (
         module="light",
         class_name="MrtLight",
         kind="emitter",
-        sample={},
         table="lights",
     ),
     Plugin(
@@ -103,7 +102,6 @@ PLUGINS = (
         module="whitted.integrator",
         class_name="MrtWhitted",
         kind="integrator",
-        sample={},
         outside="it traces them",
     ),
 )

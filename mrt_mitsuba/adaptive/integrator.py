@@ -60,8 +60,6 @@ class MrtAdaptive(mi.SamplingIntegrator):
     ``mi.render`` bounds the mean rays of a pixel, from 8 on; that of the scene's sampler does not count.
     """
 
-    plugin_name = "mrt_adaptive"
-
     def __init__(self, props: mi.Properties) -> None:
         construct_quietly(self, props)
         given = {name: props[name] for name in props if name not in PARAMETERS}
@@ -221,6 +219,3 @@ def _sensor(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
 
 def _has_bands_only(film: mi.Film) -> bool:
     return mi.has_flag(film.flags(), mi.FilmFlags.Special)  # specfilm
-
-
-mi.register_integrator(MrtAdaptive.plugin_name, MrtAdaptive)

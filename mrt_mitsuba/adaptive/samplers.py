@@ -1,4 +1,4 @@
-"""The random numbers of rays: samplers for Mitsuba, executed and registered once for each variant.
+"""The random numbers of rays: samplers for Mitsuba, executed once for each variant.
 
 Each says what adaptive sampling has to know of it: ``group``, the rays of a pixel that it traces together;
 ``fields``, into how many sets pixels can be divided such that the rays of one say nothing about those of
@@ -141,7 +141,3 @@ def _scrambled(bits: Any, a: Any, b: Any) -> Any:
 def _fraction(bits: Any) -> Any:
     """Return the number in [0, 1) whose binary digits are the bits, lowest first."""
     return mi.Float(dr.brev(bits) >> 8) * 2.0**-24
-
-
-mi.register_sampler("mrt_rays", RaySampler)
-mi.register_sampler("mrt_sequence", PixelSequence)

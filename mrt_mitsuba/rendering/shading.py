@@ -12,7 +12,7 @@ import numpy as np
 
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.files.layers import FIRST_HIT, TABLE
-from mrt_mitsuba.plugins import is_known, plugin
+from mrt_mitsuba.plugins import classes_of, is_known
 from mrt_mitsuba.plugins.parameters import ParameterError
 from mrt_mitsuba.plugins.variants import text_of
 from mrt_mitsuba.plugins.whitted.plan import KernelPlan, SceneFacts
@@ -122,7 +122,7 @@ class Shader:
         #: names of those that can be traced, without internal ones
         self.layers = frozenset(name for name, layer in TABLE.items() if layer.source == FIRST_HIT)
         self._derivatives = isinstance(integrator, mi.CppADIntegrator)  # such as prb
-        if isinstance(integrator, plugin("whitted.integrator").MrtWhitted):
+        if isinstance(integrator, classes_of("mrt_whitted")):
             try:
                 self._data = integrator.prepare(self.scene)
             except ParameterError as error:

@@ -38,8 +38,10 @@ class Reading:
         materials = snapshot.material_part
         lights = snapshot.light_part
         known = [s for s in snapshot.shapes if is_known(s)]
-        self.planes = [s for s in known if isinstance(s, classes_of("planes"))]
-        self.quadrics = [s for s in known if isinstance(s, classes_of("quadrics"))]
+        planes = classes_of("planes")
+        quadrics = classes_of("quadrics")
+        self.planes = [s for s in known if isinstance(s, planes)]
+        self.quadrics = [s for s in known if isinstance(s, quadrics)]
         analytic = {id(s) for s in (*self.planes, *self.quadrics)}
         self.native = [s for s in snapshot.shapes if id(s) not in analytic]
         #: the rows of the materials by shape, none where they have no place in one table

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,11 +18,13 @@ import mitsuba as mi
 from ..parameters import LARGEST, ParameterError, PluginError, choice, flag, integer, number, spectrum
 from ..signals import left_to_other_threads
 from ..variants import and_not, construct_quietly, largest
-from .buffers import PointBuffer
 from .facts import Reading
 from .plan import BUDGETS, KernelPlan, SceneFacts, make_plan
 from .scene_data import Hit, SceneData
 from .snapshot import Cache, Snapshot
+
+if TYPE_CHECKING:
+    from .buffers import PointBuffer
 
 # A sixteenth of a step of an 8-bit picture: the sum of many cut paths stays below half a step, and on average
 # over the report's scenes below 1e-5

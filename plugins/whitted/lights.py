@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import is_known, plugin
+from .. import classes_of, is_known
 from ..variants import is_jit, largest, pointer
 from .tables import Table
 
@@ -37,8 +37,8 @@ def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
 
 def light_rows(lights: list[mi.Emitter]) -> list[list[list[float]]] | None:
     """Return the ``fixed_row`` of each light, vectors of three; None where one has no place in a table."""
-    kind = plugin("light").MrtLight
-    if not is_jit() or mi.is_spectral or not all(isinstance(light, kind) for light in lights):
+    kinds = classes_of("lights")
+    if not is_jit() or mi.is_spectral or not all(isinstance(light, kinds) for light in lights):
         return None
     rows = [light.fixed_row() for light in lights]
     return None if None in rows else rows

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import is_known, plugin
+from .. import classes_of, is_known
 from ..lobes import CHOICES, LOBES, NUMBERS, Lobes
 from ..table import names_in
 from ..variants import is_jit, varies
@@ -25,7 +25,7 @@ def material_rows(shapes: Sequence[mi.Shape]) -> tuple[list[np.ndarray], str]:
     they have no place in one table."""
     bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
     # Of the class itself: one derived from it may have other lobes
-    mergeable = bool(bsdfs) and {type(b) for b in bsdfs.values()} == {plugin("bsdf").MrtBSDF}
+    mergeable = bool(bsdfs) and all(map(is_mrt_bsdf, bsdfs.values()))
     obstacles = {
         SCALAR_VARIANT: not is_jit(),
         "a spectral variant": mi.is_spectral,
@@ -69,7 +69,7 @@ class MaterialTable:
 
 def is_mrt_bsdf(bsdf: mi.BSDF) -> bool:
     """True if a material is an ``mrt_bsdf`` itself: a class derived from it may be anything."""
-    return type(bsdf) is plugin("bsdf").MrtBSDF
+    return type(bsdf) in classes_of("mrt_bsdf")
 
 
 def has_mirror(bsdf: mi.BSDF) -> bool:

@@ -12,13 +12,13 @@ import numpy as np
 from ..intersect import LATERAL, Frame
 from ..quadric_kinds import KINDS
 from ..variants import is_jit, put_where
-from .buffers import PointBuffer
 from .tables import Table, shape_at, shape_ids
 from .tree import Tree
 
 if TYPE_CHECKING:
     from ..axial import AxialMesh
     from ..group import MrtGroup
+    from .buffers import PointBuffer
 
 
 class Quadrics:

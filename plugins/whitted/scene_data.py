@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from operator import or_
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,15 +15,17 @@ import numpy as np
 
 from ..lobes import LOBES, Pair
 from ..variants import and_not, is_jit
-from .buffers import PointBuffer
 from .facts import Reading
 from .hit_errors import HitErrors
 from .lights import Lights
 from .materials import MaterialTable, has_mirror
 from .plan import KernelPlan, SceneFacts
-from .quadrics import Quadrics
 from .shapes import Planes, Spheres
 from .snapshot import Cache
+
+if TYPE_CHECKING:
+    from .buffers import PointBuffer
+    from .quadrics import Quadrics
 
 # Relative shortening of shadow rays, so that a surface on which a light lies does not occlude it
 SHADOW_EPSILON = 2.0**-14
@@ -220,7 +222,12 @@ def _trace(reading: Reading, plan: KernelPlan) -> Traced:
         for thing, name in zip(things, names, strict=True):
             thing.set_id(name)
     spheres = Spheres(others) if plan.spheres != "none" else None
-    return Traced(bvh, Planes(planes), Quadrics(exact) if exact else None, HitErrors(others), spheres)
+    quadrics = None
+    if exact:
+        from .quadrics import Quadrics  # only for scenes that have some
+
+        quadrics = Quadrics(exact)
+    return Traced(bvh, Planes(planes), quadrics, HitErrors(others), spheres)
 
 
 def _lights(reading: Reading, plan: KernelPlan) -> Lights:
@@ -231,6 +238,8 @@ def _light_buffers(reading: Reading, plan: KernelPlan, traced: Traced) -> list[t
     """Return lists of the objects that may block each light, with the objects, which test rays."""
     if not plan.light_buffers:
         return []
+    from .buffers import PointBuffer
+
     positions = np.array([row[0] for row in reading.light_rows or ()])
     things = [thing for thing in (traced.quadrics, traced.spheres) if thing is not None]
     return [(PointBuffer(positions, *thing.boxes()), thing) for thing in things]
@@ -240,6 +249,8 @@ def _eye_buffer(reading: Reading, plan: KernelPlan, traced: Traced) -> PointBuff
     """Return lists of the quadrics that the camera may see."""
     if not plan.eye_buffer or traced.quadrics is None:
         return None
+    from .buffers import PointBuffer
+
     return PointBuffer(np.array([reading.snapshot.eye]), *traced.quadrics.boxes())
 
 

@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import is_known, plugin
+from .. import is_known
 from ..variants import is_jit
 
 Value = TypeVar("Value")
@@ -75,7 +75,7 @@ class SnapshotPart:
         self._held[id(thing)] = thing
         if not (is_known(thing) or isinstance(thing, mi.Shape)):  # all that is read of shapes is in arrays
             self.known = self.comparable = False
-        if is_jit() and isinstance(thing, plugin("axial").AxialMesh):  # many are looked at in less time
+        if is_jit() and hasattr(thing, "snapshot_state"):  # many are looked at in less time
             plain, things, arrays = thing.snapshot_state()
             self.state += *plain, *map(id, things)
             self._held |= {id(x): x for x in things}

@@ -92,3 +92,25 @@ for variant in [*variants, *variants]:
 print("done")
 """
     assert lines(run_python, code, *order) == ["done"]
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_a_module_is_imported_once_when_a_scene_needs_it(run_python, variant):
+    """By whichever thread of Mitsuba's parallel loader comes first, and for each variant."""
+    code = """
+import sys
+mi.set_variant(sys.argv[1])
+mrt_mitsuba.register(guard=False)
+from mrt_mitsuba import plugins
+print(plugins.any_loaded())
+many = {"type": "scene"}
+for k in range(40):
+    many[f"light_{k}"] = {"type": "mrt_light", "position": [0, k, 0]}
+    many[f"plane_{k}"] = {"type": "mrt_plane", "normal": [0, 1, 0], "bsdf": {"type": "mrt_bsdf"}}
+made = mi.load_dict(many, parallel=True)
+classes = {type(thing) for s in made.shapes() for thing in (s, s.bsdf())}
+classes |= {type(light) for light in made.emitters()}
+print(*sorted(each.__name__ for each in classes))
+print(len(plugins.classes_of("quadrics")), plugins.classes_of("lights")[0] in classes)
+"""
+    assert lines(run_python, code, variant) == ["False", "MrtBSDF", "MrtLight", "MrtPlane", "0", "True"]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from mrt_mitsuba.plugins import register_modules
+from mrt_mitsuba import plugins
+
+MATTE = plugins.Plugin("matte", "bsdf", "Matte", "bsdf", package=__name__)
 
 
 def register() -> None:
     """Register in this variant, and in every one switched to later."""
-    register_modules(__name__, ["bsdf"])
+    plugins.register([MATTE])

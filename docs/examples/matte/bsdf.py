@@ -101,6 +101,3 @@ class Matte(mi.BSDF):
     def to_string(self) -> str:
         sigma = first(self.sigma)
         return f"Matte[sigma={sigma:g}, reflectance={self.reflectance}]"
-
-
-mi.register_bsdf("matte", Matte)
