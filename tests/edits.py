@@ -34,31 +34,31 @@ def _color(rng: random.Random) -> dict[str, Any]:
     return rgb(*(round(rng.uniform(0.1, 0.9), 2) for _ in range(3)))
 
 
-def _texture(rng: random.Random, kind: str) -> dict[str, Any]:
-    texels = np.array([rng.uniform(0.1, 0.9) for _ in range(12)], np.float32).reshape(2, 2, 3)
-    return {"type": kind, "bitmap": mi.Bitmap(texels), **({"raw": True} if kind == "bitmap" else {})}
+def _picture() -> mi.Bitmap:
+    return mi.Bitmap(np.linspace(0.1, 0.9, 12, dtype=np.float32).reshape(2, 2, 3))
 
 
 def _material(rng: random.Random) -> dict[str, Any]:
-    ours: dict[str, Any] = {"type": "mrt_bsdf", "alpha": rng.uniform(0.05, 0.5)}
-    ours["int_ior"] = rng.choice([0.5, 1.3, 2.0])
-    ours["fresnel"] = rng.choice(["schlick", "dielectric", "unity"])
-    ours["diffuse_reflectance"] = rng.choice([_color(rng), _texture(rng, "mrt_texture")])
-    ours["specular_reflectance"] = rng.choice([_color(rng), 0.0])
+    """Return a material of ours or of Mitsuba's; edits change its numbers."""
+    if rng.random() < 0.6:
+        textured = {"type": "mrt_texture", "bitmap": _picture()}
+        return {
+            "type": "mrt_bsdf",
+            "int_ior": rng.choice([0.5, 1.3, 2.0]),
+            "fresnel": rng.choice(["schlick", "dielectric", "unity"]),
+            "diffuse_reflectance": rng.choice([_color(rng), textured]),
+            "specular_reflectance": rng.choice([_color(rng), 0.0]),
+        }
     matte = {"type": "diffuse"}
-    metal = {"type": "conductor"}
-    stock: list[dict[str, Any]] = []
-    stock += [{"type": "diffuse", "reflectance": rng.choice([_color(rng), _texture(rng, "bitmap")])}]
-    stock += [{"type": "roughconductor", "alpha": rng.uniform(0.1, 0.5)}]
-    stock += [{"type": "twosided", "nested": {"type": "plastic", "diffuse_reflectance": _color(rng)}}]
-    stock += [metal, {"type": "roughplastic", "alpha": rng.uniform(0.1, 0.5)}]
-    stock += [{"type": "principled", "roughness": rng.uniform(0.2, 0.8), "metallic": rng.uniform(0, 1)}]
-    stock += [{"type": "blendbsdf", "weight": rng.uniform(0, 1), "a": matte, "b": metal}]
-    stock += [{"type": "mask", "opacity": rng.uniform(0, 1), "nested": matte}]
-    stock += [{"type": "bumpmap", "bump": _texture(rng, "bitmap"), "nested": matte}]
-    stock += [{"type": "normalmap", "normalmap": _texture(rng, "bitmap"), "nested": matte}]
-    stock += [{"type": "dielectric"}]
-    return ours if rng.random() < 0.6 else rng.choice(stock)
+    texture = {"type": "bitmap", "bitmap": _picture(), "raw": True}
+    stock = [{"type": name} for name in ("conductor", "dielectric", "roughconductor", "principled")]
+    stock += [{"type": "diffuse", "reflectance": _color(rng)}, {"type": "roughplastic"}]
+    stock += [{"type": "diffuse", "reflectance": texture}, {"type": "twosided", "in": {"type": "plastic"}}]
+    stock += [{"type": "blendbsdf", "weight": 0.4, "a": matte, "b": {"type": "conductor"}}]
+    stock += [{"type": "mask", "opacity": 0.6, "in": matte}]
+    stock += [{"type": "bumpmap", "bump": texture, "in": matte}]
+    stock += [{"type": "normalmap", "normalmap": texture, "in": matte}]
+    return rng.choice(stock)
 
 
 def _place(rng: random.Random) -> Any:
@@ -67,25 +67,20 @@ def _place(rng: random.Random) -> Any:
     return turned.scale(rng.uniform(0.3, 0.8))
 
 
-SHAPES = ["cube", "rectangle", "disk", "cylinder", "sdfgrid", "mrt_cone", "mrt_cylinder", "mrt_mesh", "group"]
+CORNERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (-1, 0, 1)]
+CONES = [(0, 1, 0, 0, 0, 0, 0.5), (1, 1, 0, 1, 0, 1, 0.3), (-1, 0, 1, -1, 1, 0, 0.4)]
 
 
 def _shape(rng: random.Random) -> dict[str, Any]:
-    kind = rng.choice([*["sphere"] * 3, *SHAPES])
-    if kind == "mrt_mesh":
-        points = [[rng.uniform(-1, 1) for _ in range(3)] for _ in range(6)]
-        return mesh(points, [(0, 1, 2), (3, 4, 5), (0, 2, 4)])
-    if kind == "group":
-        return group([[rng.uniform(0.1, 1) for _ in range(7)] for _ in range(3)], kind="cone")
-    form: dict[str, Any] = {}
-    if kind in ("mrt_cone", "mrt_cylinder"):
-        ends = {"mrt_cone": ("apex", "base_center"), "mrt_cylinder": ("p0", "p1")}[kind]
-        form = {ends[0]: [0, 1, 0], ends[1]: [0, 0, 0], "radius": 0.5, "segments": 16}
-    if kind == "sdfgrid":
-        distance = np.linalg.norm(np.indices((6, 6, 6)) - 2.5, axis=0)
-        grid = distance[..., None] / 5 - rng.uniform(0.2, 0.4)
-        form = {"grid": mi.TensorXf(grid.astype(np.float32))}
-    return {"type": kind, **form, "to_world": _place(rng)}
+    distance = np.linalg.norm(np.indices((6, 6, 6)) - 2.5, axis=0)[..., None] / 5 - 0.3
+    shapes = [
+        {"type": name} for name in ("sphere", "sphere", "sphere", "cube", "rectangle", "disk", "cylinder")
+    ]
+    shapes += [{"type": "sdfgrid", "grid": mi.TensorXf(distance.astype(np.float32))}]
+    shapes += [{"type": "mrt_cone", "apex": [0, 1, 0], "base_center": [0, 0, 0], "radius": 0.5}]
+    shapes += [{"type": "mrt_cylinder", "p0": [0, 1, 0], "p1": [0, 0, 0], "radius": 0.5}]
+    shapes += [mesh(CORNERS, [(0, 1, 2), (3, 4, 5), (0, 2, 4)]), group(CONES, kind="cone")]
+    return {**rng.choice(shapes), "to_world": _place(rng)}
 
 
 def scene_of(rng: random.Random) -> dict[str, Any]:
@@ -97,9 +92,9 @@ def scene_of(rng: random.Random) -> dict[str, Any]:
         "camera": view,
         "lamp": {"type": "mrt_light", "position": [2, 4, 3], "intensity": _color(rng)},
     }
-    for i in range(rng.randint(1, 3)):
-        scene[f"m{i}"] = {**_material(rng), "id": f"m{i}"}
-    materials = [name for name in scene if name.startswith("m")]
+    materials = [f"m{i}" for i in range(rng.randint(1, 3))]
+    for name in materials:
+        scene[name] = {**_material(rng), "id": name}
     for i in range(rng.randint(1, 5)):
         scene[f"s{i}"] = {**_shape(rng), "bsdf": {"type": "ref", "id": rng.choice(materials)}}
     if rng.random() < 0.7:
@@ -109,18 +104,13 @@ def scene_of(rng: random.Random) -> dict[str, Any]:
         ball = {"type": "sphere", "radius": 0.4, "bsdf": _material(rng)}
         scene["family"] = {"type": "shapegroup", "ball": ball}
         scene["child"] = {"type": "instance", "to_world": _place(rng), "of": {"type": "ref", "id": "family"}}
-    sky = {"type": "constant", "radiance": _color(rng)}
-    if rng.random() < 0.5:
-        sky = {"type": "envmap", "bitmap": _texture(rng, "bitmap")["bitmap"]}
-    more: list[dict[str, Any]] = []
-    more += [{"type": "point", "position": [-2, 3, 2], "intensity": _color(rng)}]
-    more += [{"type": "directional", "direction": [0, -1, -0.3], "irradiance": _color(rng)}]
-    more += [{"type": "spot", "to_world": view["to_world"], "intensity": _color(rng)}]
-    more += [{"type": "projector", "to_world": view["to_world"], "irradiance": _texture(rng, "bitmap")}, sky]
-    glow = {"type": "area", "radiance": _color(rng)}
-    more += [{"type": "sphere", "center": [0, 3, 0], "radius": 0.2, "emitter": glow}]
-    scene |= {f"l{i}": light for i, light in enumerate(rng.sample(more, rng.randint(0, 2)))}
-    return scene
+    beam = {"to_world": view["to_world"]}
+    lights: list[dict[str, Any]] = [{"type": "point", "position": [-2, 3, 2]}, {"type": "spot", **beam}]
+    lights += [{"type": "directional", "direction": [0, -1, -0.3], "irradiance": _color(rng)}]
+    lights += [{"type": "projector", "irradiance": {"type": "bitmap", "bitmap": _picture()}, **beam}]
+    lights += [{"type": "sphere", "center": [0, 3, 0], "radius": 0.2, "emitter": {"type": "area"}}]
+    lights += [rng.choice([{"type": "constant"}, {"type": "envmap", "bitmap": _picture()}])]
+    return scene | {f"l{i}": light for i, light in enumerate(rng.sample(lights, rng.randint(0, 2)))}
 
 
 def _changed(value: Any, rng: random.Random) -> Any:

@@ -72,11 +72,6 @@ def test_wheel_holds_every_file_of_the_packages(dist, source):
     assert all(name in wanted or ".dist-info/" in name for name in names), "nothing else"
 
 
-def test_wheel_built_without_the_sdist_is_the_same(dist, source, tmp_path):
-    run(sys.executable, "-m", "build", "--wheel", "--outdir", tmp_path, source, cwd=tmp_path)
-    assert content(tmp_path) == content(dist)
-
-
 def test_sdist_brings_what_the_tests_need(dist):
     (path,) = dist.glob("*.tar.gz")
     with tarfile.open(path) as archive:

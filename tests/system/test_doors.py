@@ -14,11 +14,10 @@ from cases import Cases
 from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.command.main import main
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.rendering import exposing
 from mrt_mitsuba.rendering.plan import Rounds
-from mrt_mitsuba.rendering.progress import NotebookProgress, Progress, TerminalProgress, default_progress
+from mrt_mitsuba.rendering.progress import NotebookProgress, Progress, default_progress
 
 SIZE = 16
 
@@ -108,16 +107,6 @@ def test_a_plan_holds_what_the_integrator_states_and_the_caller_asks(stated, opt
     assert result.options.get("target") == target
 
 
-@pytest.mark.parametrize(
-    ("metric", "whole"),
-    [("linear", "the mean luminance"), ("relative", "the true values"), ("display", "full white")],
-)
-def test_the_command_says_what_a_percentage_is_of(metric, whole, tmp_path, capsys):
-    path = str(tmp_path / "picture")
-    main([path, "0", "width=16", "height=12", "focaldist=0", "target=50%", f"metric={metric}"])
-    assert f", 50% of {whole}\n" in capsys.readouterr().out
-
-
 def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):
     shown = []
 
@@ -171,13 +160,3 @@ def test_a_script_on_a_terminal_shows_a_bar_that_moves(monkeypatch, capsys):
     progress.stage = lambda *_: nullcontext(steps.append)
     mrt.render(3, width=64, height=48, aa=2, aamode="none", focaldist=0, progress=progress)
     assert steps == [512] * 6
-
-
-def test_a_terminal_shows_rounds_on_one_line():
-    lines = io.StringIO()
-    bars = Terminal()
-    progress = TerminalProgress(file=lines, bar_file=bars)
-    mrt.render(box(), integrator="path", spp=64, aamode="noise", progress=progress)
-    assert not lines.getvalue()
-    assert "\n" not in bars.getvalue().strip()
-    assert "error" in bars.getvalue()

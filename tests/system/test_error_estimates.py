@@ -226,7 +226,9 @@ def test_stated_errors_are_those_of_the_blurred_picture():
     """A floor and a ball out of focus: a blur averages noise, and leaves what is sharp as it is."""
     scene = load_kind("calm", 48)
     options = {"aamode": "noise", "spp": 32, "focaldist": 3.0, "focalrange": 1.0}
-    results = [mrt.render(scene, seed=seed, **options) for seed in range(16)]
+    seen: list[Any] = []
+    results = [mrt.render(scene, seed=seed, on_round=seen.append, **options) for seed in range(16)]
+    assert np.array_equal(seen[-1].image, results[-1].image)
     true = np.var([result.image for result in results], axis=0, ddof=1).mean(-1)
     stated = np.mean([result.layers["error.Y"] ** 2 for result in results], axis=0)
     sharp = np.mean([mrt.render(scene, seed=0, **options | {"focaldist": 0}).layers["error.Y"] ** 2])

@@ -195,19 +195,3 @@ def test_a_warning_names_the_line_of_the_user(door):
                 warned.clear()
                 again()
     assert {each.filename for each in warned} == {__file__}
-
-
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
-@pytest.mark.parametrize("size", [(1, 1), (2, 2), (1, 2)])
-def test_the_smallest_films_print_nothing(variant, size, capfd):
-    """A picture of so few numbers was first taken for the size of one, with a complaint on the terminal."""
-    inside = {"type": "mrt_adaptive", "spp": 8, "nested": {"type": "path"}}
-    for integrator in (inside, {"type": "mrt_whitted"}):
-        loaded = scene(integrator, size)
-        for picture in (
-            mi.render(loaded, spp=16),
-            mrt.render(loaded).image,
-            mrt.prepare(loaded)().image,
-        ):
-            assert np.shape(picture)[:2] == size[::-1]
-    assert "nanobind" not in "".join(capfd.readouterr())

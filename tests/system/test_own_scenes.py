@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -81,13 +80,6 @@ def test_a_filter_lies_around_the_middle_of_a_pixel(variant, rfilter):
     assert_allclose(image.mean(0) + image.mean(0)[::-1], 1, atol=0.05)
 
 
-def test_a_scene_renders_by_itself_as_mitsuba_renders_it():
-    """Under a filter so wide that each pixel sees all others."""
-    film = {"rfilter": {"type": "gaussian", "stddev": 4.0}, "sample_border": True}  # 16 pixels to each side
-    scene = _load("area_light", width=16, height=12, film=film)
-    assert_allclose(mrt.render(scene).image, np.array(mi.render(scene)), atol=1e-4)
-
-
 def test_a_film_of_another_size_shows_the_whole_view():
     """It loses its crop window within the render, and has it again afterwards."""
     options = {"integrator": "mrt_whitted", "aa": 1, "lattice": "report", "layers": ["depth"]}
@@ -122,17 +114,6 @@ def test_filters_alpha_and_channels_are_kept(tmp_path):
     assert read_exr(tmp_path / "kept.exr").layers.keys() == result.layers.keys()
 
 
-def test_luminance_and_what_is_not_kept_are_said():
-    scene = _load("spot", film={"pixel_format": "luminance"})
-    image = mrt.render(scene, spp=16, seed=2).image
-    assert_allclose(image, np.repeat(np.array(mi.render(scene, spp=16, seed=2)), 3, -1), atol=1e-4)
-    xyz = _load("spot", film={"pixel_format": "xyz"})
-    assert "without pixel format xyz: pictures are linear sRGB" in str(mrt.render(xyz, spp=1).plan)
-    noise = str(mrt.render(_load("stratified"), aamode="noise", spp=16).plan)
-    assert "without StratifiedSampler: adaptive sampling continues" in noise
-    assert "the lattice that was asked for" in str(mrt.render(scene, lattice="centered", spp=1).plan)
-
-
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)
 def test_bands_of_a_spectral_film(variant):
     def band(low: int, high: int) -> dict[str, Any]:
@@ -148,11 +129,7 @@ def test_bands_of_a_spectral_film(variant):
     assert "in the picture, only as layers" in str(result.plan)
 
 
-def test_size_sensor_and_parameters(tmp_path):
-    scene = _load("crop")
-    before = list(scene.sensors()[0].film().crop_size())
-    assert mrt.render(scene, width=20, height=10, spp=4).image.shape == (10, 20, 3)
-    assert list(scene.sensors()[0].film().crop_size()) == before
+def test_sensor_and_parameters(tmp_path):
     above = sensor([0, 9, 0.1], [0, 0, 0])
     two = _load("spot", other=above | {"film": above["film"] | {"width": WIDTH, "height": HEIGHT}})
     first, second = (mrt.render(two, integrator="direct", sensor=k, spp=4).image for k in (0, 1))
@@ -166,11 +143,11 @@ def test_size_sensor_and_parameters(tmp_path):
         '<integer name="width" value="$wide"/><integer name="height" value="4"/></film></sensor>'
         '<emitter type="constant"><rgb name="radiance" value="$glow"/></emitter></scene>'
     )
-    assert mrt.render(file, params={"wide": 12}).image.shape == (4, 12, 3)
     out = tmp_path / "out"
-    assert main([str(out), f"scene={file}", "glow=0.25", "format=exr", "quiet=1"]) == 0
-    assert read_exr(f"{out}.exr").image.mean() == pytest.approx(0.25, rel=1e-3)
-    assert main([str(out), f"scene={file}", "glo=0.25", "quiet=1"]) == 2
+    assert main([str(out), f"scene={file}", "glow=0.25", "wide=12", "format=exr", "quiet=1"]) == 0
+    image = read_exr(f"{out}.exr").image
+    assert image.shape == (4, 12, 3)
+    assert image.mean() == pytest.approx(0.25, rel=1e-3)
 
 
 @pytest.mark.filterwarnings("ignore:a few rays dominate the error")
@@ -194,45 +171,12 @@ def test_errors_end_at_their_target_against_the_best_sampler(monkeypatch):
     assert rows[0][3] in adaptive.SAMPLERS
 
 
-@pytest.mark.parametrize("aim", [1.0, 1.3])
-def test_costs_are_those_of_the_best_sampler_to_its_own_error(monkeypatch, aim):
-    """Of made up pictures: noise of a known size, which takes known seconds."""
-    random = np.random.default_rng(1)
-    true = np.ones((96, 96, 3))
-
-    def picture(deviation: float) -> np.ndarray:
-        return random.normal(1, deviation, true.shape)
-
-    def ours(scene: Any, options: Any, seed: int) -> Any:
-        error = SimpleNamespace(high=options["target"])
-        return SimpleNamespace(
-            image=picture(aim * options["target"]), rounds=[SimpleNamespace(spp=30)], error=error
-        )
-
-    def timed_in_turns(sides: Any, turns: int) -> Any:
-        return [([side(turn) for turn in range(turns)], np.full(turns, 32.0)) for side in sides]
-
-    monkeypatch.setattr(adaptive, "adaptive", ours)
-    monkeypatch.setattr(adaptive, "timed_in_turns", timed_in_turns)
-    others = [([picture(0.1)] * 2, np.full(2, 8.0)), ([picture(0.02)] * 2, np.full(2, 64.0))]
-    row = adaptive.to_an_error(None, true, {"metric": "linear"}, others, turns=2, seeds=6)
-    assert row["sampler"] == adaptive.SAMPLERS[1]  # a 25th of the squared error for 8 times the time
-    assert row["time"] == 0.5
-    assert_allclose([row["target"], row["error"]], [0.02, aim], rtol=0.03)
-    assert (row["missed"], row["unsaid"]) == ((1, 6) if aim > 1.15 else (0, 0))
-
-
-@pytest.mark.parametrize("spp", [16, 40, 100])
-def test_a_mean_of_rays_is_spent(spp):
-    """No more than asked for, and little less, also under a wide filter: there, tiles share rays out."""
-    spent = mrt.render(_load("area_light"), aamode="noise", spp=spp, seed=1).rounds[-1].spp
-    assert 0.9 * spp <= spent <= spp
-
-
-@pytest.mark.parametrize("limits", [{"spp": 32, "maxspp": 1024}, {"spp": 1024, "maxspp": 32}], ids=str)
-def test_the_smaller_of_two_limits_counts(limits):
+@pytest.mark.parametrize("limits", [{"spp": 16}, {"spp": 100}, {"spp": 1024, "maxspp": 32}], ids=str)
+def test_a_mean_of_rays_is_spent(limits):
+    """No more than the smaller limit, and little less, also under a wide filter: there, tiles share rays
+    out."""
     spent = mrt.render(_load("area_light"), aamode="noise", seed=1, **limits).rounds[-1].spp
-    assert 0.9 * 32 <= spent <= 32
+    assert 0.9 * min(limits.values()) <= spent <= min(limits.values())
 
 
 def test_rays_go_where_the_noise_is():
@@ -306,17 +250,13 @@ def test_rounds_report_and_stop():
     assert len(result.rounds) == 2
     assert [r.rmse for r in result.rounds] == [r.rmse for r in seen]
     assert seen[1].rmse < seen[0].rmse
-    assert seen[1].seconds > seen[0].seconds
     assert seen[1].spp > seen[0].spp
-    assert seen[1].image.shape == (HEIGHT, WIDTH, 3)
     assert seen[1].error.shape == (HEIGHT, WIDTH)
     assert_array_equal(seen[1].image, result.image)
     again = mrt.render(_load("area_light"), target=1e-4, on_round=lambda now: now.spp < 17)
     assert_array_equal(again.image, result.image)  # to the bit, also under a filter
     assert_array_equal(seen[1].samples, result.layers["samples.Y"])
-    header = result.header()
-    assert header["mrt:error"]["rmse"] == result.error.rmse
-    assert len(header["mrt:rounds"]) == 2
+    assert result.header()["mrt:error"]["rmse"] == result.error.rmse
 
 
 def test_limits_of_rays_and_seconds():
@@ -328,18 +268,15 @@ def test_limits_of_rays_and_seconds():
     assert mrt.render(scene, spp=4).error is None
 
 
-def test_a_relative_target_is_a_share_of_the_mean_luminance(capsys, tmp_path):
+def test_a_relative_target_is_a_share_of_the_mean_luminance():
     scene = _load("area_light")
     luminance = mrt.render(scene, spp=256, aa=1, aamode="none").image.mean((0, 1)) @ (0.2127, 0.7152, 0.0722)
     result = mrt.render(scene, target="5%")
     target = result.error.target
     assert target == pytest.approx(0.05 * luminance, rel=0.1)
-    assert result.rounds[-1].rmse < 1.1 * target
     assert f"5% of the mean luminance, {target:.3g}" in str(result.plan)
     assert result.header()["mrt:error"]["target"] == target
     assert_array_equal(result.image, mrt.render(scene, target=target).image)
-    with pytest.warns(mrt.MrtWarning, match=r"target=0.01%, which is [0-9.e-]+, is not reached: maxspp=20"):
-        mrt.render(scene, target="0.01%", maxspp=20)
     inside = {"type": "mrt_adaptive", "target": "5%", "nested": {"type": "path", "max_depth": 4}}
     found = np.array(mi.render(scene, integrator=mi.load_dict(inside)))
     assert_array_equal(found[..., :3], result.image)
@@ -352,39 +289,6 @@ def test_a_share_of_a_black_picture_ends_with_one_warning():
     assert len(warned) == 1
     assert len(result.rounds) == 1
     assert not result.image.any()
-
-
-def test_a_target_beyond_the_smallest_numbers_spends_all_rays():
-    with pytest.warns(mrt.MrtWarning, match="target=1e-170 is not reached") as warned:
-        assert mrt.render(_load("area_light"), target=1e-170, maxspp=20).rounds[-1].spp < 22
-    assert len(warned) == 1
-
-
-def test_who_stops_a_render_still_hears_of_radiance_that_has_no_square():
-    scene = mi.cornell_box()
-    scene["light"]["emitter"]["radiance"] = {"type": "rgb", "value": 1e30}
-    with pytest.warns(mrt.MrtWarning, match="are left out of the error"):
-        mrt.render(scene, target=1e-4, width=WIDTH, height=HEIGHT, on_round=lambda now: False)
-
-
-def _assert_true(result: mrt.Result, truth: np.ndarray) -> None:
-    """An interval of 95 %, half as wide again: other machines round, and so trace, other rays."""
-    assert result.error.low / 1.5 <= _rmse(result.image, truth) <= 1.5 * result.error.high
-
-
-def test_errors_are_those_of_the_finished_picture():
-    """After a depth of field, which makes them smaller, and in grey where the film is."""
-    size = {"width": 64, "height": 48}
-    truth = mrt.render(3, aa=20, aamode="none", lattice="film", **size).image
-    for target in (0.02, 0.005):
-        _assert_true(mrt.render(3, target=target, **size), truth)
-    scene = _load("gloss", film={"pixel_format": "luminance"})
-    seen: list[Any] = []
-    for options in ({}, {"focaldist": 4, "focalrange": 0.5}):
-        truth = mrt.render(scene, spp=2**11, **options).image
-        result = mrt.render(scene, target=0.03, seed=2, on_round=seen.append, **options)
-        _assert_true(result, truth)
-        assert_array_equal(seen[-1].image, result.image)
 
 
 contrary = Cases()

@@ -63,15 +63,6 @@ def test_slow_variants_are_warned_of_once_in_a_process(run_python):
     assert done.stderr.count("one ray at a time") == 1
 
 
-def test_scene_numbers_dicts_and_mitsuba_scenes_agree():
-    size = {"width": 64, "height": 48}
-    by_number = mrt.render(3, **size, aa=2, aamode="sobel", focaldist=0).image
-    scene = mrt.scene_dict(3, **size)
-    options = {"aa": 2, "aamode": "sobel", "lattice": "report"}
-    assert np.array_equal(by_number, mrt.render(scene, **options).image)
-    assert np.array_equal(by_number, mrt.render(mi.load_dict(scene), **options).image)
-
-
 def test_rendering_leaves_no_scene_behind():
     """Integrator and scene must not own each other: Mitsuba's shapes would pile up in every later kernel."""
 
@@ -83,30 +74,6 @@ def test_rendering_leaves_no_scene_behind():
         ids.append(int(np.max(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))))
         del scene
     assert ids[0] == ids[2]
-
-
-@pytest.mark.parametrize("kind", ["directional", "spot", "mrt_light"])
-def test_direct_light_equals_mitsubas_direct(kind):
-    """One delta light, no clamp, no bounce: nothing is left to differ but the stand-in of the plane."""
-    look = mi.ScalarTransform4f().look_at([2, 3, 1], [0, 0, 0], [0, 1, 0])
-    light = {
-        "directional": {"direction": [-1, -2, -0.5], "irradiance": 2.0},
-        "spot": {"to_world": look, "intensity": 20.0},
-        "mrt_light": {"position": [2, 3, 1], "intensity": 2.0},
-    }[kind]
-    nodes = mrt.scene_dict(0, width=64, height=48)
-    kept = {k: node for k, node in nodes.items() if not k.startswith(("light", "sky", "integrator"))}
-    scene = mi.load_dict({**kept, "light": {"type": kind, **light}})
-    whitted = {"type": "mrt_whitted", "max_depth": 1, "clamp": False}
-    ours = mrt.render(scene, aa=1, aamode="none", integrator=whitted, layers=["depth"])
-    stock = mrt.render(scene, aa=1, aamode="none", integrator="direct").image
-    assert stock.max() > 0.1
-    near = ours.layers["depth.Z"] < 40  # the stand-in of the plane ends at 50
-    difference = np.abs(ours.image - stock).max(axis=-1)[near]
-    assert difference.size > 1000
-    # shadow edges may fall on the other side of a pixel's centre
-    assert np.mean(difference > 1e-5 * (1 + stock.max())) < 0.002
-    assert np.median(difference) < 1e-6
 
 
 MOVING = {"motion": (0.1, 0, 0), "motionsamples": 4}

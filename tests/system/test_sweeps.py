@@ -17,6 +17,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import psutil
 import pytest
 from cases import Cases
 from clusters import PATIENCE, Cluster, wait_for
@@ -96,7 +97,6 @@ def test_pictures_are_those_of_render_alone(address, tmp_path):
     assert len(table.rows) == 12
     assert len({read_exr(tmp_path / "out" / row["file"]).image.tobytes() for row in table.rows}) >= 6
     assert not table.failed
-    assert not left_over(tmp_path / "out")
     for row in table.rows:
         alone = mrt.render(row["scene"], aa=row["aa"], seed=row["seed"], **small)
         found = read_exr(tmp_path / "out" / row["file"])
@@ -116,31 +116,18 @@ def test_workers_use_the_callers_variant(variant, address, tmp_path):
     assert read_exr(tmp_path / "picture.exr").header["mrt:variant"] == variant
 
 
-PLACES = [[[0.5, 0, 0, x], [0, 0.5, 0, 1], [0, 0, 0.5, 1], [0, 0, 0, 1]] for x in (1.0, 2.0)]
-ZIPPED = {"sphere_0.to_world": PLACES, "focaldist": [1.0, 2.0]}
-CROSSED = {"params": [{"resx": 40}, {"resx": 50}], "material_0.alpha": [0.1]}
-
-
-@pytest.mark.parametrize(
-    ("zipped", "grid", "names"),
-    [
-        (True, ZIPPED, ["frame_0000", "frame_0001"]),
-        (False, CROSSED, [f"params=resx-{n},material_0.alpha=0.1" for n in (40, 50)]),
-    ],
-)
-def test_parameters_of_the_scene(address, tmp_path, zipped, grid, names):
-    """Those of ``mi.traverse`` and those that a file declares; frames are numbered for films."""
+def test_parameters_of_a_file(address, tmp_path):
+    """Those of ``mi.traverse`` and those that it declares."""
     mine = tmp_path / "mine.xml"
     out = tmp_path / "out"
     assert cli.main(["export", "3", "--xml", str(mine)]) == 0
-    scene, size = (3, SMALL) if zipped else (mine, {"aa": 1})
-    table = mrt.sweep(scene, out, grid=grid, cluster=address, zipped=zipped, png=True, **size)
+    grid = {"params": [{"resx": 40}, {"resx": 50}], "material_0.alpha": [0.1]}
+    table = mrt.sweep(mine, out, grid=grid, cluster=address, png=True, aa=1)
+    names = [f"params=resx-{n},material_0.alpha=0.1" for n in (40, 50)]
     assert [row["file"] for row in table.rows] == [f"{name}.exr" for name in names]
     assert sorted(path.stem for path in out.glob("*.png")) == names
     for row in table.rows:
-        keys = {key: value for key, value in row.items() if "." in key}
-        params = keys | row.get("params", {})
-        alone = mrt.render(scene, params=params, focaldist=row.get("focaldist"), **size)
+        alone = mrt.render(mine, params=row["params"] | {"material_0.alpha": 0.1}, aa=1)
         assert read_exr(out / row["file"]).image.tobytes() == alone.image.tobytes()
 
 
@@ -178,33 +165,21 @@ def test_pictures_of_another_version_are_made_again(address, tmp_path, monkeypat
         runtime.versions.cache_clear()
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["table.csv", "table.csv/", "seed=1.exr", "seed=1.png", "link", "own.png"],
-)
+@pytest.mark.parametrize("name", ["table.csv", "seed=1.exr", "seed=1.png", "link"])
 def test_a_file_of_the_users_own_is_refused_by_name(address, tmp_path, name):
-    stands_for = {"link": "seed=1.exr", "own.png": "seed=1.png"}
-    mine = tmp_path / stands_for.get(name, name)
-    options: dict[str, Any] = {"grid": {"seed": [1]}, "png": True}
-    if name == "own.png":  # next to a picture that a sweep made
-        mrt.sweep(3, tmp_path, grid={"seed": [1]}, cluster=address, **SMALL)
-    if name == "link":
-        mine.symlink_to(tmp_path / "nothing")
-    elif name == "table.csv/":
-        mine.mkdir()
-    elif name.endswith(".exr") or name == "own.png":
+    options: dict[str, Any] = {"grid": {"seed": [1]}, **SMALL}
+    mine = tmp_path / name
+    mine.write_text("file,error\nmine,\n")
+    if name.startswith("seed"):
         mrt.render(0, width=8, height=8, aa=1).save(mine)
-    else:
-        mine.write_text("file,error\nmine,\n")
-
-    def contents() -> dict[Path, Any]:
-        return {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
-
-    before = contents()
-    text = f"{mine.name}.*((not made by|not the table of) a sweep.*another folder|it is a folder)"
-    with pytest.raises(OutputError, match=text):
-        mrt.sweep(3, tmp_path, resume=False, **options, **SMALL)
-    assert contents() == before
+    if name == "seed=1.png":  # next to a picture that a sweep made
+        mrt.sweep(3, tmp_path, cluster=address, **options)
+    if name == "link":
+        (tmp_path / "seed=1.exr").symlink_to(mine)
+    before = mine.read_bytes()
+    with pytest.raises(OutputError, match=r"(not made by|not the table of) a sweep.*another folder"):
+        mrt.sweep(3, tmp_path, resume=False, png=True, **options)
+    assert mine.read_bytes() == before
 
 
 # What each worker runs first: it changes a scene file that it has rendered
@@ -225,11 +200,9 @@ def test_a_scene_file_counts_by_its_contents(address, mortal, tmp_path):
     out = tmp_path / "out"
     assert cli.main(["export", "0", "--xml", str(scene)]) == 0
     options: dict[str, Any] = {"cluster": address, **SMALL}
-    first = mrt.sweep(scene, out, **options).rows[0]
+    mrt.sweep(scene, out, **options)
     scene.write_text(scene.read_text().replace('value="60"', 'value="50"'))
-    second = mrt.sweep(scene, out, **options).rows[0]
-    assert second != first
-    assert read_exr(out / "picture.exr").header["mrt:sweep"]
+    mrt.sweep(scene, out, **options)
     assert read_exr(out / "picture.exr").image.tobytes() == mrt.render(scene, **SMALL).image.tobytes()
     namesake = tmp_path / "other" / "mine.xml"
     with pytest.raises(UsageError, match="2 jobs would write the same file scene=mine"):
@@ -254,22 +227,16 @@ def wrong_options(says: str, **options: Any) -> None:
 wrong_grid("'aaa' is not an option of render: did you mean aa", {"aaa": [1]})
 wrong_grid("aa is an empty list", {"aa": []})
 wrong_grid(r'grid=\[1\]: give a dict of lists, such as {"aa": \[1, 2\]}', [1])
-wrong_grid(r"'a\\nb' is not an option of render", {"a\nb": [1]})
 wrong_grid("more than 100000 jobs", {"seed": itertools.count()})
-wrong_grid("more than 100000 jobs", {"seed": range(1000), "aa": range(1, 65), "spp": [1, 2]})
-wrong_grid("params=3: must be a dict", {"params": [3]})
 wrong_grid(r"aa is 3; give a list of values, such as \[3\]", {"aa": 3})
 wrong_grid("2 jobs would write the same file aa=1", {"aa": [1, 2, 1]})
 wrong_grid("aa is given twice", {"aa": [1]}, aa=2)
 mistyped = "no parameter material_0.alpa: did you mean material_0.alpha?"
 wrong_grid(mistyped, {"material_0.alpa": [0.1]})
-wrong_grid("material_0.alpha='rough': must be a Float", {"material_0.alpha": ["rough"]})
-wrong_grid("scene is given twice", {"scene": [1]}, scene=3)
 wrong_grid("zipped axes must be of one length", {"aa": [1, 2], "seed": [1]}, zipped=True)
 
 wrong_options("cannot make the folder", out=__file__ + "/out")
 wrong_options("give the scene as a number, a dict or a path", scene={"type": threading.Lock()})
-wrong_options("width=0: must be", width=0)
 wrong_options("plugins=none.py: no such Python file", plugins="none.py")
 wrong_options("workers=0: must be a whole number", workers=0)
 wrong_options("give one of them", workers=2, cluster=NOWHERE)
@@ -362,8 +329,6 @@ def waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_the_only_worker_of_this_machine_is_replaced_when_it_dies(waiting, tmp_path):
-    import psutil
-
     def children() -> list[psutil.Process]:
         return psutil.Process().children(recursive=True)
 
@@ -476,7 +441,7 @@ class Listening(Progress):
     before it, as clusters of other tests do."""
 
     def __init__(self) -> None:
-        self.before = set(self.listeners())
+        self.before = self.listeners()
         self.addresses: set[str] = set()
 
     @contextlib.contextmanager
@@ -484,28 +449,13 @@ class Listening(Progress):
         yield self.note
 
     def note(self, steps: int) -> None:
-        found = self.listeners()
-        self.addresses |= {found[socket] for socket in found.keys() - self.before}
+        self.addresses |= {ip for ip, _ in self.listeners() - self.before}
 
-    def listeners(self) -> dict[str, str]:
-        """Addresses by socket."""
-        import psutil
-
+    def listeners(self) -> set[tuple[str, int]]:
+        """Addresses and ports."""
         own = psutil.Process()
-        sockets = {
-            os.readlink(link)
-            for process in [own, *own.children(recursive=True)]
-            for link in Path(f"/proc/{process.pid}/fd").iterdir()
-            if os.path.islink(link)
-        }
-        found = {}
-        for table in ("tcp", "tcp6"):
-            for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
-                words = line.split()
-                socket = f"socket:[{words[9]}]"
-                if words[3] == "0A" and socket in sockets:
-                    found[socket] = words[1].split(":")[0]
-        return found
+        every = [each for one in [own, *own.children(recursive=True)] for each in one.net_connections("tcp")]
+        return {tuple(each.laddr) for each in every if each.status == psutil.CONN_LISTEN}
 
 
 def test_a_sweep_of_this_machine_is_closed_to_others(tmp_path, monkeypatch):
@@ -538,7 +488,7 @@ def test_a_sweep_of_this_machine_is_closed_to_others(tmp_path, monkeypatch):
     listening = Knocking()
     table = mrt.sweep(scene, "out", plugins="mine.py", workers=1, progress=listening, **SMALL)
     assert not table.failed
-    assert listening.addresses == {"0100007F"}
+    assert listening.addresses == {"127.0.0.1"}
     assert not (tmp_path / "was-run").exists()
     alone = mrt.render(scene, **SMALL)
     assert read_exr(tmp_path / "out" / "picture.exr").image.tobytes() == alone.image.tobytes()
@@ -578,6 +528,7 @@ def test_mean_of_seeds(address, tmp_path):
 
 
 def test_values_of_mitsuba_and_of_numpy_in_a_grid(address, tmp_path):
+    """Frames are numbered, for films."""
     mrt.register()
     moved = mi.ScalarTransform4f().translate([0, 0, -1])
     grid = {
@@ -587,6 +538,7 @@ def test_values_of_mitsuba_and_of_numpy_in_a_grid(address, tmp_path):
     }
     table = mrt.sweep(3, tmp_path, grid=grid, zipped=True, cluster=address, **SMALL)
     assert [row["material_0.alpha"] for row in table.rows] == [0.1, 0.1]
+    assert [row["file"] for row in table.rows] == ["frame_0000.exr", "frame_0001.exr"]
     params = {key: table.rows[0][key] for key in grid}
     alone = mrt.render(3, params=params, **SMALL).image.tobytes()
     assert {read_exr(tmp_path / row["file"]).image.tobytes() for row in table.rows} == {alone}

@@ -156,21 +156,6 @@ def test_a_bounce_costs_what_the_index_leaves_of_ten(ior, bounces):
     assert np.array(found.bounces).item() == bounces
 
 
-def test_a_scene_without_shapes_is_the_sky():
-    view = sensor([0, 0, 5], [0, 0, 0], (8, 6))
-    sky = {"type": "constant", "radiance": 0.3}
-    scene = mi.load_dict({"type": "scene", "integrator": WHITTED, "sensor": view, "sky": sky})
-    assert np.array(mi.render(scene, spp=4)) == pytest.approx(0.3, rel=1e-6)
-
-
-def test_mirror_rays_are_counted_where_there_are_none():
-    view = sensor([0, 0, 5], [0, 0, 0], (8, 6))
-    scene = {"type": "scene", "sensor": view, "floor": FLOOR}
-    result = mrt.render(scene, integrator=WHITTED, aa=2, aamode="none", lattice="report", layers=["bounces"])
-    assert result.layers["bounces.Y"].shape == (6, 8)
-    assert not result.layers["bounces.Y"].any()
-
-
 @pytest.mark.parametrize("reflectance", [0.1, 1.0])
 def test_no_shadow_ray_for_light_that_a_mirror_makes_too_dim(reflectance):
     """What a light may add to the picture decides, not what it adds to the wall that the mirror shows."""

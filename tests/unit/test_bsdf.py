@@ -17,7 +17,6 @@ from mrt_mitsuba.validation.bsdf_probe import (
     at_angle,
     evaluate,
     lobe_pairs,
-    pairs_about,
     rgb,
 )
 from mrt_mitsuba.validation.laws import probe
@@ -106,105 +105,29 @@ def test_equals_roughconductor(variant, alpha, distribution):
     assert max(found.values()) < POINTWISE
 
 
-@pytest.mark.parametrize("distribution", exact.DISTRIBUTIONS)
-@pytest.mark.parametrize(
-    ("alpha", "theta", "visible"), [(0.05, 85, True), (0.3, 89, True), (3.0, 80, True), (0.3, 80, False)]
-)
-def test_samples_fit_density_and_value(distribution, alpha, theta, visible):
-    """Drawn from a fine grid of numbers: the mean weight is the integral of the value, and as many directions
-    are drawn as the density integrates to."""
-    lobe = {"distribution": distribution, "fresnel": "unity", "diffuse_reflectance": 0.0}
-    made = bsdf(alpha=alpha, sample_visible=visible, **lobe)
-    count = 1500
-    wi = at_angle(theta)
-    u = np.mgrid[:count, :count].reshape(2, -1)
-    u = (u + 0.5) / count
-    si = dr.zeros(mi.SurfaceInteraction3f, count**2)
-    si.wi = mi.Vector3f(wi.tolist())
-    drawn, weight = made.sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(u))
-    # Half vectors by D cos θ, but more of them in the tail: a value or density times 4 ωo·h / (D cos θ), and
-    # the derivative of ``share``, has the integral for its mean
-    share = 1 - (1 - u[0]) ** 3
-    tangent = alpha * np.sqrt(-np.log1p(-share) if distribution == "beckmann" else share / (1 - share))
-    around = 2 * np.pi * u[1]
-    h = np.ones((3, count**2))
-    h[0] = tangent * np.cos(around)
-    h[1] = tangent * np.sin(around)
-    h /= np.linalg.norm(h, axis=0)
-    cos_d = wi @ h
-    wo = 2 * cos_d * h - wi[:, None]
-    steepness = (tangent / alpha) ** 2
-    d_cos = np.exp(-steepness) if distribution == "beckmann" else (1 + steepness) ** -2
-    d_cos /= np.pi * alpha**2 * h[2] ** 3
-    value, density = made.eval_pdf(mi.BSDFContext(), si, mi.Vector3f(wo))
-    scale = np.where(cos_d > 0, 4 * cos_d / d_cos * 3 * (1 - u[0]) ** 2, 0)
-    mean_value = np.mean(np.array(value[0], np.float64) * scale)
-    probability = np.mean(np.array(density, np.float64) * scale)
-    # The grid is 1e-4 off, Mitsuba's drawing of slopes 1e-4; the fit of G₁ for a normaliser was 3e-3 off
-    assert np.mean(np.array(weight[0], np.float64)) == pytest.approx(mean_value, rel=4e-4)
-    assert np.mean(np.array(drawn.pdf) > 0) == pytest.approx(probability, rel=4e-4)
-
-
-def exact_lobe(wi: Any, wo: Any, alpha: Any, *, distribution: str, form: str, int_ior: Any) -> Any:
-    """Return D F G / (4 cos θi cos θo) for directions above the surface; outside index 1."""
-    i = exact.unit(wi)
-    o = exact.unit(wo)
-    h = exact.unit([a + b for a, b in zip(i, o, strict=True)])
-    cos_d = sum(a * b for a, b in zip(i, h, strict=True))
-    f = exact.fresnel(form, cos_d, 1, int_ior)
-    microfacets = exact.DISTRIBUTIONS[distribution]
-    d = microfacets.d(h[2], alpha)
-    g = microfacets.g1(i, alpha) * microfacets.g1(o, alpha)
-    return d * f * g / (4 * i[2] * o[2])
-
-
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
     ("distribution", "alpha"),
-    [("beckmann", 0.02), ("beckmann", 0.3), ("beckmann", -0.0432), ("ggx", 0.02), ("ggx", 0.3)],
+    [
+        *((name, alpha) for name in exact.DISTRIBUTIONS for alpha in (1e-6, 0.02, 0.3, 20.0)),
+        ("beckmann", -0.0432),
+    ],
 )
-def test_value_is_the_formula(form, distribution, alpha):
+def test_value_and_density_are_the_formulas(form, distribution, alpha):
     """Against 50 digits, at the same float32 directions and parameters."""
     wi, wo = (np.float32([*v, (0, 0, 1)]) for v in lobe_pairs(60, abs(alpha)))
-    made = colored(distribution=distribution, alpha=alpha, int_ior=1.7, fresnel=form)
-    value, _ = evaluate(made, wi, wo)
-    alpha32 = np.float32(alpha)
-    ior32 = np.float32(1.7)
-    pairs = zip(wi, wo, strict=True)
-    given = {"distribution": distribution, "form": form, "int_ior": ior32}
-    lobe = [float(exact_lobe(i, o, alpha32, **given)) for i, o in pairs]
-    f = np.array(KD) / np.pi + np.outer(lobe, KS)
-    # a dozen roundings, of which exp enlarges some by 16; and as float32 directions are not quite of length
-    # 1, their half vector is off by 1e-7 / |h|, which the lobe enlarges by 8 / alpha
-    tolerance = 2e-5 if abs(alpha) > 0.1 else 1e-4
-    assert_allclose(value, np.maximum(f * wo[:, 2:], 0), rtol=tolerance, atol=1e-6)
-
-
-def test_ggx_is_stable_for_any_roughness():
-    """In float32 against 50 digits, with the derivative by alpha, from narrow lobes to none."""
-    rng = np.random.default_rng(0)
-    alpha = np.float32(10 ** rng.uniform(-8, 2, 300))
-    slopes = alpha * 10 ** rng.uniform(-2, 3, 300)
-    wi, wo = pairs_about(10 ** rng.uniform(-5, 0, 300), np.minimum(slopes, 1), rng)
-    above = wo[:, 2] > 1e-6
-    wi, wo, alpha = wi[above], wo[above], alpha[above]
-    roughness = mi.Float(alpha)
-    dr.enable_grad(roughness)
-    made = bsdf(distribution="ggx", fresnel="unity", diffuse_reflectance=0.0)
-    parameters = mi.traverse(made)
-    parameters["alpha"] = roughness
-    parameters.update()
-    value, pdf = made.eval_pdf(mi.BSDFContext(), interaction(wi), mi.Vector3f(wo.T))
-    dr.forward(roughness)
-    for k, (i, o, a) in enumerate(zip(wi, wo, alpha, strict=True)):
-        lobe = exact.lobe(i, o, a, "ggx")
-        step = exact.number(a) * exact.mpf("1e-20")
-        slope = (exact.lobe(i, o, exact.number(a) + step, "ggx").value - lobe.value) / step
-        assert value[0][k] == pytest.approx(float(lobe.value), rel=5e-6)
-        assert pdf[k] == pytest.approx(float(lobe.d / (4 * exact.GGX.visible_cos(i, a))), rel=5e-6)
-        # the slope passes through zero: its error is relative to its terms, of the size of value / alpha
-        tolerance = 2e-5 * float(lobe.value / exact.number(a))
-        assert dr.grad(value[0])[k] == pytest.approx(float(slope), abs=tolerance)
+    lobe = {"distribution": distribution, "alpha": alpha, "int_ior": 1.7, "fresnel": form}
+    value, _ = evaluate(colored(**lobe), wi, wo)
+    _, density = evaluate(bsdf(diffuse_reflectance=0.0, **lobe), wi, wo)
+    visible_cos = exact.DISTRIBUTIONS[distribution].visible_cos
+    for i, o, found, pdf in zip(wi, wo, value, density, strict=True):
+        known = exact.lobe(i, o, np.float32(alpha), distribution)
+        fresnel = exact.fresnel(form, np.linalg.norm(np.float64(i) + o) / 2, 1, np.float32(1.7))
+        f = np.array(KD) / np.pi * o[2] + np.array(KS) * float(known.value * fresnel)
+        # a dozen roundings, of which exp enlarges some by 16
+        assert_allclose(found, np.maximum(f, 0), rtol=2e-5, atol=1e-6)
+        expected = known.d / (4 * visible_cos(i, np.float32(abs(alpha))))
+        assert pdf == pytest.approx(float(expected), rel=2e-5, abs=1e-6)
 
 
 @in_variants
@@ -232,9 +155,7 @@ def test_reflected_light_is_depolarised(variant):
     value = b.eval(mi.BSDFContext(), si, wo)
     _, weight = b.sample(mi.BSDFContext(), si, 0.01, mi.Point2f(0.3, 0.2))
     for matrix in (value, weight):
-        for i, j in np.ndindex(4, 4):
-            largest = dr.max(matrix[i, j], axis=None)
-            assert largest > 0 if i == j == 0 else dr.all(matrix[i, j] == 0, axis=None)
+        assert {each for each in np.ndindex(4, 4) if dr.any(matrix[each] != 0, axis=None)} == {(0, 0)}
 
 
 @pytest.mark.parametrize("visible", [True, False])

@@ -17,7 +17,6 @@ from cases import Cases
 
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.command import options, registry
-from mrt_mitsuba.command.render import banner
 from mrt_mitsuba.errors import MrtError, MrtWarning, SceneError
 from mrt_mitsuba.rendering import api
 from mrt_mitsuba.rendering.progress import TerminalProgress
@@ -54,23 +53,6 @@ def test_render_writes_and_says_what_the_report_says(tmp_path, capsys):
     float(last.removeprefix("Render time: ").removesuffix("s"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.exr", "out.png"]
     assert (warnings.showwarning, signal.getsignal(signal.SIGTERM)) == before
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        ("0", "F distance: off"),
-        ("4 aa=1", "F distance: 0.1"),
-        ("3 focaldist=0", "F distance: off"),
-        ("3 aamode=noise", "AA:         as noise needs"),
-        ("scene=a.xml", "Width:      from the file"),
-        ("scene=a.obj", "AA mode:    sobel"),
-        ("3 target=2%", "AA mode:    noise"),
-        ("scene=a.xml target=0.01", "AA mode:    noise"),
-    ],
-)
-def test_banner_names_what_is_in_force(words, line):
-    assert line in banner(options.parse(["out", *words.split()])).splitlines()
 
 
 def test_quiet_prints_nothing(tmp_path, capsys):
@@ -230,20 +212,6 @@ def test_every_word_of_a_command_arrives_and_is_explained(name, capsys):
 
 def test_limits_are_the_measures_of_a_difference():
     assert set(registry.LIMITS) <= {*Difference.__dataclass_fields__, "flip"}
-
-
-words = Cases()
-words("check", "scene=x.xml out=a=b", {"scene": "x.xml", "out": "a=b"})
-words("check", "--out a quick=1 0", {"scene": 0, "out": "a", "quick": "1"})
-words("check", "a.xml glow=3 fov=2", {"scene": "a.xml", "params": {"glow": "3", "fov": "2"}})
-words("check", "1 plugins=a.py plugins=b", {"scene": 1, "plugins": ["a.py", "b"]})
-words("export", "--xml a=b 3 width=1", {"scene": 3, "xml": "a=b", "width": "1"})
-words("export", "3 --stock xml=a", {"scene": 3, "xml": "a", "stock": True})
-
-
-@pytest.mark.parametrize(("name", "text", "values"), words)
-def test_words_are_read(name, text, values):
-    assert options.read_scene(registry.command_parser(name), text.split()) == values
 
 
 def test_every_option_arrives_at_the_render_or_is_the_commands_own():

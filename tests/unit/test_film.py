@@ -80,26 +80,6 @@ SETTINGS({"target": 0.05, "maxspp": 64})
 SETTINGS({"target": "5%", "maxspp": 64})
 
 
-@pytest.mark.parametrize("rfilter", ["gaussian", "lanczos"])
-def test_rows_added_one_by_one_are_those_added_together(rfilter):
-    """Also where a filter reaches beyond the pictures from a row, at either end."""
-    film = Film(mi.load_dict(sensor([0, 0, 1], [0, 0, 0], (3, 2), rfilter=rfilter)))
-    pixels = film.pixels
-    rng = np.random.default_rng(0)
-    place = np.stack([np.arange(2 * pixels) % film.width, np.arange(2 * pixels) // film.width % film.height])
-    place = (place + rng.random(place.shape)).astype(np.float32)
-    values = rng.random((3, 2 * pixels), np.float32)
-    whole, rows = (Canvas(film, np.ones((2, pixels)), 3, moments=False) for _ in range(2))
-    for canvas, size in ((whole, 2 * pixels), (rows, film.width)):
-        for start in range(0, 2 * pixels, size):
-            some = slice(start, start + size)
-            rays = np.zeros(2 * pixels, int)
-            rays[some] = 1
-            canvas.put(mi.Point2f(place[:, some]), [mi.Float(channel) for channel in values[:, some]], rays)
-    assert (rows.sums == whole.sums).all()
-    assert (rows.weights == whole.weights).all()
-
-
 @pytest.mark.filterwarnings("ignore::mrt_mitsuba.errors.MrtWarning")
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 3e38])
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])

@@ -77,36 +77,6 @@ def test_the_comparison_with_the_loops_decides_nearly_every_pixel(detector):
     assert 0.1 < mask[1:-1, 1:-1].mean() < 0.9
 
 
-@pytest.mark.parametrize(
-    ("level", "options", "is_edge"),
-    [
-        # value and threshold are the same float32 number: "left alone if r < threshold", so this is an edge
-        (0.0, {"contrast_offset": 0.5, "absolute_threshold": 0.5}, True),
-        (0.0, {"contrast_offset": 0.5, "absolute_threshold": 0.5001}, False),
-        # flat: 0.05 against 0.125 L, so the report refines every flat place darker than L = 0.4
-        (0.399**2, {}, True),
-        (0.401**2, {}, False),
-    ],
-)
-def test_luma_refines_a_flat_picture_from_its_threshold_on(level, options, is_edge):
-    assert luma_edges(np.full((3, 3, 3), level), **options).mask[1, 1] == is_edge
-
-
-def test_luma_counts_a_negative_sum_as_black():
-    black, below = np.ones((2, 5, 5, 3))
-    black[2, 2] = 0
-    below[2, 2] = -3
-    assert_array_equal(luma_edges(black).value, luma_edges(below).value)
-
-
-@pytest.mark.parametrize(("threshold", "is_edge"), [(0, True), (3.99, True), (4, False)])
-def test_sobel_needs_more_than_its_threshold(threshold, is_edge):
-    step = np.tile(np.array([10.5, 10.5, 11.5, 11.5, 11.5])[:, None] / 255, (5, 1, 3))
-    edges = sobel_edges(step, threshold=threshold)
-    assert edges.value[2].tolist() == [0, 4, 4, 0, 0]  # one grey level times 1 + 2 + 1
-    assert edges.mask[2].tolist() == [False, is_edge, is_edge, False, False]
-
-
 def test_noise_of_the_channels_adds_up_as_if_it_were_one():
     step = np.zeros((5, 6, 3))
     step[:, 3:] = 40 / 255

@@ -75,15 +75,6 @@ def test_ten_thousand_materials_take_one_bsdf():
     assert loaded.integrator().prepare(loaded).quadrics.count == 10_000
 
 
-def test_stand_in_encloses_the_right_volume():
-    numbers = [[0, 0, 0, 1, 0, 0, 0.5], [3, 1, 0, 3, 0, 0, 0.2]]
-    buffers = mi.traverse(mi.load_dict(group(numbers, kind="cone", segments=64)))
-    vertices = buffers["vertex_positions"].numpy().reshape(-1, 3)
-    faces = buffers["faces"].numpy().reshape(-1, 3)
-    volume = np.linalg.det(vertices[faces]).sum() / 6
-    assert volume == pytest.approx(np.pi / 3 * (0.25 + 0.04), rel=2e-3)  # 64 sides for a circle: 1.6e-3
-
-
 def test_texture_coordinates_of_a_sphere_are_mitsubas():
     rng = np.random.default_rng(3)
     d = rng.normal(size=(3, 500))

@@ -10,15 +10,9 @@ from cases import Cases
 
 from mrt_mitsuba import machine, runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.machine import MAX_BAND, MAX_WAVEFRONT, Budget, Workspace, usable_cores
+from mrt_mitsuba.machine import Budget, Workspace, usable_cores
 
 GIB = 2**30
-
-
-def test_plenty_of_memory_gives_the_largest_parts():
-    space = Workspace.from_budget(800, 600, 4, budget=Budget(64 * GIB))
-    assert space.wavefront_size(4) == MAX_WAVEFRONT
-    assert space.band_rows(1024) == MAX_BAND // 1024
 
 
 @pytest.mark.parametrize(
@@ -35,16 +29,6 @@ def test_plenty_of_memory_gives_the_largest_parts():
 def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
     with pytest.raises(UsageError, match=f"16384x16384 pixels needs {needed} of memory, and 4.0 GiB may be"):
         Workspace.from_budget(16384, 16384, 3, budget=Budget(4 * GIB), **more)
-
-
-@pytest.mark.parametrize(("used", "flushed"), [(GIB // 4, False), (GIB // 4 + 1, True)])
-def test_the_cache_is_flushed_after_a_large_pass(monkeypatch, used, flushed):
-    import drjit as dr
-
-    called = []
-    monkeypatch.setattr(dr, "flush_malloc_cache", lambda: called.append(True))
-    Workspace(GIB).flush_cache(used)
-    assert bool(called) is flushed
 
 
 def test_more_than_the_machine_has_is_never_used(monkeypatch):

@@ -17,7 +17,6 @@ from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import MrtWarning, SceneError
-from mrt_mitsuba.scene import obj
 from mrt_mitsuba.scene.export import write_xml
 from mrt_mitsuba.scene.model import Camera, Mesh
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL
@@ -69,14 +68,11 @@ geometry(SQUARE + "f 1 2 3 4 1 2\n", [HALF, *([[0, 0, 0], *ends] for ends in FAN
 
 
 ARROW = [(0, 0), (2, 0), (2, 2), (1, 0.2), (0, 2)]
-STAR = [((2 + k % 2) * math.cos(k / 2), (2 + k % 2) * math.sin(k / 2)) for k in range(12)]
 COMB = [(0, 0), (21, 0), *((k / 4, 3 - 2.5 * (k % 2)) for k in range(80, 0, -1))]
 RING = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)]
 polygons = Cases()
 polygons([*ARROW[:2], (0.4, 0.4), (0, 2)], 0.8)
 polygons(ARROW, 2.2)
-polygons([(0, 0), (3, 0), (3, 1), (1, 1), (1, 3), (0, 3)], 5)
-polygons(STAR, None)
 polygons(COMB, None)
 polygons(RING, 12)  # with a hole
 
@@ -106,17 +102,6 @@ def test_a_face_that_crosses_itself_is_a_warning(model):
     assert len(mesh.faces) == 3
 
 
-def test_lines_that_hold_nothing_and_repeat_cost_little(model, monkeypatch):
-    """20 MB of empty lines, or 200,000 libraries, took minutes."""
-    read: list[object] = []
-    monkeypatch.setattr(obj, "read_mtl", lambda *given, **options: read.append(given) or {})
-    monkeypatch.setattr(
-        obj._Reader, "read", lambda self, block, do=obj._Reader.read: read.append(do(self, block))
-    )
-    model("mtllib model.mtl\n" * 99 + "\n \n# x\ng y\ns 1\n" * 9999 + SQUARE + "f 1 2 3\n", MTL)
-    assert len(read) < 150
-
-
 @pytest.mark.parametrize(("text", "found"), geometry)
 def test_geometry(model, text, found):
     (mesh,) = model(text)
@@ -131,8 +116,7 @@ def test_runs_of_lines_equal_single_lines(model):
     rng = np.random.default_rng(1)
     points = rng.integers(-999, 999, size=(4200, 3)) / 64
     faces = rng.integers(1, 4201, size=(4200, 3))
-    lines = [f"v {x:.9g} {y:.9e} {z}" for x, y, z in points] + [f"vt {x:g} {y:g}" for x, y, _ in points]
-    lines += [f"f {a}/{b} {b}/{c} {c}/{a}" for a, b, c in faces]
+    lines = [f"v {x:.9g} {y:.9e} {z}" for x, y, z in points] + [f"f {a} {b} {c}" for a, b, c in faces]
     fast, slow = (model("".join(line + end for line in lines))[0] for end in ("\n", " #\n"))
     assert_array_equal(triangles(fast), triangles(slow))
     assert_array_equal(triangles(fast), points[faces - 1])
@@ -256,9 +240,12 @@ def test_a_texture_is_looked_for_next_to_the_model_before_the_library(model, tmp
     assert model(text)[0].material.texture == str(near)
 
 
-def test_faces_without_coordinates_have_no_texture(model, tmp_path):
+@pytest.mark.parametrize("corners", ["1/4 2/3 3/2", "-5/-1 -4/-2 -3/-3"])
+def test_faces_without_coordinates_have_no_texture(model, tmp_path, corners):
+    """Of five points and four coordinates, counted from either end."""
     (tmp_path / "picture.png").write_bytes(b"")
-    textured, plain = model(USE_PAINTED.replace("f 1/1 2/2 3/3", "f 1/4 2/3 3/2\nf 1 3 4"), PAINTED)
+    faces = f"v 9 9 9\nf {corners}\nf 1 3 4"
+    textured, plain = model(USE_PAINTED.replace("f 1/1 2/2 3/3", faces), PAINTED)
     assert textured.material.texture == str(tmp_path / "picture.png")
     assert_array_equal(textured.uvs[textured.faces[0]], [[0, 1], [1, 1], [1, 0]])
     assert plain.material.texture is None

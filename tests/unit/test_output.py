@@ -215,12 +215,6 @@ def test_what_is_no_picture_is_refused(tmp_path, ending, picture):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_list_is_a_picture(tmp_path, image):
-    for name in ("a.png", "a.exr"):
-        output.save(tmp_path / name, image.tolist())
-    assert_array_equal(output.read_exr(tmp_path / "a.exr").image, image)
-
-
 attributes = Cases()
 attributes("k" * 255, "x", "x")
 attributes("k", np.float32(0.5), 0.5)
@@ -433,8 +427,3 @@ def test_saving_without_a_name_says_so(tmp_path, monkeypatch, names):
     with pytest.raises(UsageError, match="name of a file"):
         result.save(*names)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_unknown_tonemap_is_refused_in_every_format(tmp_path, image):
-    with pytest.raises(UsageError, match="tonemap='hdr': must be report or srgb"):
-        output.save(tmp_path / "a.exr", image, tonemap="hdr")

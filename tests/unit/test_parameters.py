@@ -62,13 +62,6 @@ def test_the_header_holds_values_of_any_type(tmp_path, key, value, written):
     assert json.loads(read_exr(tmp_path / "a.exr").header["mrt:options"])["params"] == {key: written}
 
 
-def test_a_result_is_shown_in_a_line_and_as_a_picture():
-    result = mrt.render(3, aamode="noise", spp=16, width=32, height=24)
-    assert str(result).startswith("<Result of scene 3: 32x24, layers depth.Z")
-    assert f"error {result.error}" in str(result)
-    assert result._repr_png_().startswith(b"\x89PNG")
-
-
 refused = Cases()
 refused({"material_0.alpa": 1}, "no parameter material_0.alpa: did you mean material_0.alpha?")
 refused({"x.y": 1}, r"no parameter x.y: print\(mi.traverse\(scene\)\) lists all")

@@ -175,24 +175,3 @@ def test_every_option_makes_a_difference(name):
     after = mrt.render(**options | {name: VALUES[name]})
     same = str(before.plan) == str(after.plan) and np.array_equal(before.image, after.image)
     assert not same, f"{name}={VALUES[name]} makes no difference"
-
-
-NEW_LAYER = """
-import mrt_mitsuba as mrt
-from mrt_mitsuba.files import layers, read_exr
-
-row = layers.Layer("tangent", "XYZ", layers.FIRST_HIT, "tangent along u", lambda r: r.si.sh_frame.s)
-layers.TABLE["tangent"] = layers.LAYERS["tangent"] = row
-for integrator in ("mrt_whitted", "path"):
-    result = mrt.render(9, width=8, height=6, layers=["tangent"], integrator=integrator, seed=1)
-    result.save("a.exr")
-    assert {"tangent.X", "tangent.Y", "tangent.Z"} <= read_exr("a.exr").layers.keys()
-    assert "with tangent" in str(result.plan)
-from mrt_mitsuba.command.tools import usage
-assert "tangent" in usage()
-"""
-
-
-def test_a_new_layer_takes_one_row(run_python):
-    """Plan, tracer, files and help read it from there."""
-    run_python(NEW_LAYER)

@@ -13,11 +13,7 @@ from nodes import documented, example, sensor
 from numpy.testing import assert_allclose
 
 from mrt_mitsuba import plugins
-from mrt_mitsuba.plugins.lobes import LOBES, Lobes, Pair
 from mrt_mitsuba.plugins.table import PLUGINS, Plugin
-from mrt_mitsuba.plugins.whitted import facts
-from mrt_mitsuba.plugins.whitted.materials import material_rows
-from mrt_mitsuba.plugins.whitted.snapshot import Cache, Snapshot
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -163,48 +159,6 @@ def test_a_number_that_is_set_needs_no_new_kernel(row):
         assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)
 
 
-def test_lobes_may_share_a_flag(monkeypatch):
-    """Bits that were added up made a third flag: of three lobes without one, light was missing."""
-    from mrt_mitsuba.plugins import lobes as module
-    from mrt_mitsuba.plugins.whitted import scene_data
-
-    class Sheen:
-        name = "sheen"
-        reflectance = "diffuse_reflectance"
-        default = 0.0
-        flag = "DiffuseReflection"
-        depends_on: tuple[str, ...] = ()
-
-        def value(self, at: Lobes, pair: Pair) -> Any:
-            return mi.UnpolarizedSpectrum(0.25 * pair.wo.z)
-
-    three = (LOBES[0], Sheen(), LOBES[1])
-    for place in (module, scene_data):
-        monkeypatch.setattr(place, "LOBES", three)
-    context = scene_data.context_of(("diffuse", "sheen"))
-    at = Lobes(
-        "unity", {"diffuse_reflectance": mi.Color3f(0.5), "alpha": mi.Float(0.1)}, mi.Vector3f(0, 0, 1)
-    )
-    pair = Pair.above(mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Bool(True))
-    assert np.ravel(at.value(context, pair))[0] == pytest.approx(0.5 / np.pi + 0.25)  # float32
-
-
-def test_a_lobe_is_left_out_only_with_all_of_its_flag(monkeypatch):
-    """Kernels leave lobes out by their flags: the plan said that one was left out, which was evaluated."""
-
-    class Sheen:
-        name = "sheen"
-        flag = "DiffuseReflection"
-
-    matte = {"type": "mrt_bsdf", "specular_reflectance": 0.0}
-    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": matte}})
-    rows = [np.vstack([row[:3], np.zeros_like(row[:1])]) for row in material_rows(scene.shapes())[0]]
-    monkeypatch.setattr(facts, "LOBES", (*LOBES[:2], Sheen()))
-    monkeypatch.setattr(facts, "material_rows", lambda shapes: (rows, ""))
-    found = facts.Reading(Snapshot(scene, None), Cache()).facts.lobes
-    assert found == (("diffuse", True), ("specular", False), ("sheen", True))
-
-
 def test_derivatives_by_shapes_warn_once(capfd):
     """AD gives +0.012 where differences give -0.160: what moves the outline is left out."""
     for kind, ends in (("mrt_cone", ("apex", "base_center")), ("mrt_cylinder", ("p0", "p1"))):
@@ -223,13 +177,6 @@ def test_derivatives_by_shapes_warn_once(capfd):
             parameters.update()
             dr.backward(dr.mean(mi.render(scene, parameters, spp=1).array))
         assert "".join(capfd.readouterr()).count("leave out how outlines") == 1
-
-
-def test_normals_of_both_kinds_are_refused():
-    row = next(row for row in PLUGINS if row.name == "mrt_mesh")
-    normals = mi.Bitmap(np.array([[[0, 0, 1]] * 3], np.float32))
-    with pytest.raises(Exception, match="not both"):
-        mi.load_dict(example(row, normals=normals, face_normals=True))
 
 
 def derivative_of_gloss(key: str, way: str) -> float:

@@ -190,28 +190,6 @@ def test_search_against_float64(kind, count, scale, place):
     assert count < 120 or np.isfinite(exact).mean() > 0.3
 
 
-@pytest.mark.parametrize("kind", CLOSED)
-def test_derivatives_are_those_of_the_surface(kind):
-    """Of places in the unit frame, by texture coordinates: against differences of a step of 1e-5."""
-
-    def place(u: float, v: float) -> Any:
-        angle = 2 * np.pi * u
-        radius = np.sin(np.pi * v)
-        z = np.cos(np.pi * v)
-        if kind != "sphere":
-            z = 1 - v
-            radius = z if kind == "cone" else 1
-        return V(radius * np.cos(angle), radius * np.sin(angle), z)
-
-    step = 1e-5
-    for u, v in ((0.1, 0.3), (0.7, 0.6)):
-        by_u, by_v = KINDS[kind].derivatives(place(u, v), LATERAL)
-        across = (place(u + step, v) - place(u - step, v)) / (2 * step)
-        along = (place(u, v + step) - place(u, v - step)) / (2 * step)
-        assert list(by_u) == pytest.approx(list(across), abs=1e-7)
-        assert list(by_v) == pytest.approx(list(along), abs=1e-7)
-
-
 def test_kernel_does_not_grow_with_the_number_of_cones():
     def operations(count: int) -> int:
         cones = tuple(Cone((i, 1, 0), (i, 0, 0), 0.4, MATTE) for i in range(count))

@@ -74,24 +74,3 @@ def test_however_groups_are_cut_each_ray_is_traced_once(most):
         done += some.count
         traced.append(np.stack([np.array(lane) for lane in some.lanes()]))
     assert_array_equal(np.concatenate(traced, 1), [pixels, numbers])
-
-
-@pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("kind", ["mrt_sequence", "independent"])
-@pytest.mark.parametrize("draw", ["next_1d", "next_2d"])
-def test_a_lane_that_is_switched_off_draws_its_number_later(kind, draw):
-    """As of Mitsuba's own samplers: what a branch draws for some rays changes nothing for the others."""
-    sampler = mi.load_dict({"type": kind})
-    some = np.arange(64) % 3 == 0
-
-    def draws(active: mi.Bool) -> list[np.ndarray]:
-        if kind == "mrt_sequence":
-            sampler.start(dr.arange(mi.UInt32, 64), mi.UInt32(7))
-        else:
-            sampler.seed(7, 64)
-        return [np.array(getattr(sampler, draw)(mask)) for mask in (active, True)]
-
-    first, second = draws(mi.Bool(True))
-    _, later = draws(mi.Bool(some))
-    assert (first != second).all()
-    assert_array_equal(later, np.where(some, second, first))

@@ -84,21 +84,3 @@ def test_triangles_show_the_nearest_texel(tmp_path):
         assert_allclose(found * np.pi, color, atol=1e-6)
     with pytest.raises(SceneError, match="textures on triangles only"):
         pixel(scene(Sphere((0, 0, 0), 1, matte)))
-
-
-def test_no_light_is_negative_and_each_is_seen_by_itself():
-    """With a roughness of the wrong sign, Smith's term is negative where the eye is low, the light high."""
-    wrong = Plane((1, 2, 0), 0, replace(WOOD, alpha=-1.5, diffuse=(0, 0, 0)))
-    high = Light((1.6, 1.7, 0), (1, 1, 1))
-    assert (pixel(scene(wrong, lights=[high]), clamp=False) == 0).all()
-    ball = Sphere((0, 0, 0), 1, WOOD)
-    lights = [Light((x, 1, 0), (1, 1, 1)) for x in (5, -5)]
-    one = reference_render(scene(ball, lights=lights), **ONE_PIXEL)
-    other = reference_render(scene(ball, lights=lights[::-1]), **ONE_PIXEL)
-    assert one.lights != other.lights
-    lid = Sphere((3, 2.5, 0), 0.5, WOOD)  # hides the higher of two lights before the ball
-    high, low, back = (Light(place, (1, 1, 1)) for place in ((5, 5, 0), (5, 1, 0), (-5, 1, 0)))
-    pairs = (high, back), (back, high), (low, back), (back, low), (high, low), (low, high)
-    seen = [reference_render(scene(ball, lid, lights=pair), **ONE_PIXEL) for pair in pairs]
-    assert len({int(each.lights[0, 0]) for each in seen}) == len(pairs)
-    assert len({int(each.path[0, 0]) for each in seen}) == 1

@@ -142,21 +142,3 @@ def test_files_that_multiply_are_refused(nested, text):
     nested.write_text(f'<scene version="3.0.0">{text}</scene>')
     with pytest.raises(SceneError, match=r"come to more than|includes more than 1000 files"):
         mrt.render(nested)
-
-
-def test_a_numbered_scene_can_be_changed_by_keys_of_its_dict():
-    nodes = mrt.scene_dict(3, width=96, height=72)
-    nodes["sphere_0"] |= {"center": [0, 0.5, 0.2], "radius": 0.4}
-    nodes["material_0"]["diffuse_reflectance"]["value"] = [0.9, 0.1, 0]
-    nodes["light_0"]["position"] = [1, 2, 1]
-    nodes["sensor"]["to_world"] = nodes["sensor"]["to_world"] @ mi.ScalarTransform4f().rotate([0, 0, 1], 9)
-    keys = ["sphere_0.center", "sphere_0.radius", "light_0.position", "sensor.to_world"]
-    params = {key: nodes[key.split(".")[0]][key.split(".")[1]] for key in keys}
-    params |= {"sensor.to_world": np.array(params["sensor.to_world"].matrix)}
-    params |= {"material_0.diffuse_reflectance": [0.9, 0.1, 0]}
-    images = [
-        mrt.render(scene, focaldist=0, lattice="report", **SIZE, **more).image
-        for scene, more in ((nodes, {}), (3, {"params": params}), (3, {}))
-    ]
-    assert_array_equal(images[0], images[1])
-    assert abs(images[0] - images[2]).max() > 0.1
