@@ -121,7 +121,7 @@ def _plain(value: Any) -> Any:
     return array.tolist() if few else f"<{type(value).__name__}>"
 
 
-def render(
+def render(  # noqa: PLR0913 - each option has a name that editors show
     scene: Any = 0,
     *,
     width: int | None = None,

@@ -18,7 +18,7 @@ from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.worker import describe
 
 
-def sweep(
+def sweep(  # noqa: PLR0913 - each option has a name that editors show
     scene: Any,
     out: StrPath,
     *,

@@ -50,6 +50,7 @@ def test_any_amount_refines_to_full_supersampling(aa, lattice):
     # a centered lattice of even size does not hold the pixel's centre: its first sample is traced in addition
     further = aa**2 - 1 if lattice == "report" or aa % 2 else aa**2
     assert adaptive.rays["primary"] == 33 * 21 + refined.sum() * further
+    assert set(adaptive.layers["samples.Y"][refined]) == {aa**2}
     one = mrt.render(1, **{**options, "aa": 1}, aamode="none").image
     assert_array_equal(adaptive.image[~refined], one[~refined])
     # the same up to 64 values summed in another order

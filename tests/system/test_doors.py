@@ -1,7 +1,6 @@
 """Every door to a render leads through one plan: what is refused, shown on the way, and stated."""
 
 import io
-import re
 import sys
 import types
 from contextlib import nullcontext
@@ -130,12 +129,9 @@ def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):
     progress.bar_file = io.StringIO()
     result = mrt.render(box(), integrator="path", spp=64, aamode="noise", progress=progress)
     assert shown.pop().startswith(f"error {result.rounds[-1].rmse:.2g}")
-    after = shown[::2]  # between them, what the next round adds
-    assert len(after) == len(result.rounds)
-    assert all(re.search(r"spp, now \d+ more$", html) for html in shown[1::2])
-    for html, found in zip(after, result.rounds, strict=True):
-        assert html.startswith('<img src="data:image/png;base64,')
-        assert f"error {found.rmse:.2g}, {found.spp:.0f} spp" in html
+    after = zip(result.rounds, shown[::2], strict=True)  # between them, what the next round adds
+    assert all(f"error {found.rmse:.2g}" in html for found, html in after)
+    assert all(html.startswith("<img src=") for html in shown[::2])
 
 
 class Terminal(io.StringIO):

@@ -177,52 +177,36 @@ def foreign_light(where: str) -> str:
     return f"dimmed_{where}"
 
 
-@both_doors
+def prepared(loaded: mi.Scene) -> Callable[[mi.Scene], np.ndarray]:
+    again = mrt.prepare(loaded, aa=1, aamode="none")
+    return lambda scene: again().image
+
+
+@pytest.mark.parametrize("door", [*DOORS, "prepare"])
 @pytest.mark.parametrize("where", ["instance", "class", "module"])
-@pytest.mark.parametrize("what", but_slow(["texture", "texture of a light", "light"], {"texture of a light"}))
+@pytest.mark.parametrize(
+    "what", but_slow(["texture", "texture of a light", "light", "sky"], {"texture of a light"})
+)
 def test_what_others_wrote_in_python_is_asked_each_time(variant, door, what, where):
     LEVEL[0] = 0.2
-    if what == "texture":
-        skin = {"type": "mrt_bsdf", "diffuse_reflectance": {"type": foreign_texture(where)}}
-        content = {"ball": {"type": "sphere", "bsdf": skin}}
-    elif what == "light":
-        kind = foreign_light(where)
-        content = {f"lamp{k}": {"type": kind, "position": [k - 4, 3, 4]} for k in range(9)}
-    else:
-        lamp = {"type": "mrt_light", "position": [0, 3, 4], "intensity": {"type": foreign_texture(where)}}
-        content = {"lamp0": lamp}
+    level: dict[str, Any] = {"type": foreign_light(where) if what == "light" else foreign_texture(where)}
+    lamp = {"type": "mrt_light", "position": [0, 3, 4], "intensity": level}
+    content = {
+        "texture": {"ball": {"type": "sphere", "bsdf": {"type": "mrt_bsdf", "diffuse_reflectance": level}}},
+        "texture of a light": {"lamp0": lamp},
+        "light": {f"lamp{k}": {**level, "position": [k - 4, 3, 4]} for k in range(9)},
+        "sky": {"integrator": {"type": "mrt_whitted", "sky": level}},
+    }[what]
     loaded = scene(**content)
-    render = DOORS[door]
+    render = prepared(loaded) if door == "prepare" else DOORS[door]
     first = render(loaded)
-    for level in (0.4, 0.0, 0.3):
-        set_level(loaded, where, level)
+    for number in (0.4, 0.0, 0.3):
+        set_level(loaded, where, number)
         changed = render(loaded)
         assert abs(changed - first).max() > 1e-2
         other = scene(**content)
-        set_level(other, where, level)
-        assert_array_equal(changed, render(other))
-        first = changed
-
-
-@pytest.mark.parametrize("where", ["instance", "class", "module"])
-@pytest.mark.parametrize("what", ["sky", "texture", "light"])
-def test_a_prepared_scene_asks_what_others_wrote_in_python(variant, what, where):
-    LEVEL[0] = 0.2
-    level: dict[str, Any] = {"type": foreign_light(where) if what == "light" else foreign_texture(where)}
-    content: dict[str, Any] = {"lamp0": {**level, "position": [0, 3, 4]}}
-    if what == "sky":
-        content = {"integrator": {"type": "mrt_whitted", "sky": level}}
-    elif what == "texture":
-        skin = {"type": "mrt_bsdf", "diffuse_reflectance": level}
-        content = {"ball": {"type": "sphere", "bsdf": skin}}
-    loaded = scene(**content)
-    again = mrt.prepare(loaded, aa=1, aamode="none")
-    first = again().image
-    for number in (0.4, 0.0):
-        set_level(loaded, where, number)
-        changed = again().image
-        assert_array_equal(changed, mrt.render(loaded, aa=1, aamode="none").image)
-        assert abs(changed - first).max() > 1e-2
+        set_level(other, where, number)
+        assert_array_equal(changed, DOORS["mrt.render" if door == "prepare" else door](other))
         first = changed
 
 

@@ -1,4 +1,4 @@
-"""The house: imports without cycles, private names at home, short functions of few parameters and branches.
+"""The house: imports without cycles, private names at home, short statements. Ruff bounds functions.
 
 The modules are read, not imported, so that imports inside functions and for type checkers count as well.
 """
@@ -17,15 +17,6 @@ ROOT = Path(__file__).parents[2]
 FOLDERS = {"mrt_mitsuba": "mrt_mitsuba"} | {
     name: f"mrt_mitsuba.{name}" for name in ("plugins", "scenes_xml", "validation")
 }
-LINES = 60
-PARAMETERS = 8
-BRANCHES = 12
-ALLOWED = {
-    "mrt_mitsuba.plugins.whitted.integrator.MrtWhitted._trace",  # the camera ray and the bounces together
-    "mrt_mitsuba.sweeps.run.sweep",  # each option has a name that editors and ``inspect`` can show
-    "mrt_mitsuba.rendering.api.render",
-}
-
 # Modules of the package itself, that any package but those that stand alone may use
 SHARED = {
     "errors",
@@ -40,7 +31,6 @@ SHARED = {
 STAND_ALONE = {"plugins", "laws"}
 
 _INNER = ast.stmt | ast.excepthandler | ast.match_case  # of a statement, and with nodes of its own
-_BRANCH = ast.If | ast.IfExp | ast.For | ast.While | ast.ExceptHandler | ast.match_case | ast.comprehension
 
 
 class WithoutTypes(ast.NodeTransformer):
@@ -76,66 +66,9 @@ def imported(name: str) -> Iterator[tuple[str, str]]:
                 yield (whole, "") if whole in MODULES else (source, alias.name)
 
 
-def classes_in(function: ast.FunctionDef) -> list[ast.ClassDef]:
-    """Classes that a function makes: their methods count by themselves."""
-    return [node for node in function.body if isinstance(node, ast.ClassDef)]
-
-
-def functions(name: str) -> Iterator[tuple[str, ast.FunctionDef]]:
-    """Functions and methods of a module with their full names; of nested ones, those that are outermost."""
-
-    def inside(node: ast.AST, path: str) -> Iterator[tuple[str, ast.FunctionDef]]:
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.FunctionDef):
-                yield f"{path}.{child.name}", child
-                for own in classes_in(child):
-                    yield from inside(own, f"{path}.{child.name}.{own.name}")
-            else:
-                yield from inside(child, f"{path}.{child.name}" if isinstance(child, ast.ClassDef) else path)
-
-    yield from inside(MODULES[name], name)
-
-
-ALL = {path: (function, SOURCES[name]) for name in MODULES for path, function in functions(name)}
-
-
-def lines_of_code(function: ast.FunctionDef, source: str) -> int:
-    """Lines of the body, without docstring, classes, comments and blank lines."""
-    lines = source.splitlines()
-    body = [node for node in function.body if node not in classes_in(function)]
-    body = body[1:] if ast.get_docstring(function) else body
-    text = [line.strip() for node in body for line in lines[node.lineno - 1 : node.end_lineno]]
-    return sum(bool(line) and not line.startswith("#") for line in text)
-
-
-def parameters(function: ast.FunctionDef, source: str) -> int:
-    """Number of parameters but for self and cls."""
-    every = (*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs)
-    return sum(a.arg not in ("self", "cls") for a in every)
-
-
-def branches(function: ast.FunctionDef, source: str) -> int:
-    """Ways to go on at decisions, functions inside left out."""
-    count = 0
-    waiting = list(ast.iter_child_nodes(function))
-    while waiting:
-        node = waiting.pop()
-        if isinstance(node, ast.FunctionDef | ast.Lambda):
-            continue
-        count += isinstance(node, _BRANCH)
-        waiting += ast.iter_child_nodes(node)
-    return count
-
-
 def graph() -> dict[str, set[str]]:
     """Return for each module the modules of the project that it imports anywhere."""
     return {name: {source for source, _ in imported(name) if source in MODULES} - {name} for name in MODULES}
-
-
-def test_every_module_imported_is_there():
-    """Inside functions as well, where nothing else would notice until they run."""
-    named = {(name, source) for name in MODULES for source, _ in imported(name)}
-    assert not {pair for pair in named if pair[1].split(".")[0] == "mrt_mitsuba" and pair[1] not in MODULES}
 
 
 def test_imports_make_no_cycle():
@@ -177,16 +110,6 @@ def test_private_names_stay_at_home():
         if source in MODULES and taken.startswith("_") and not taken.startswith("__")
     ]
     assert not wrong
-
-
-@pytest.mark.parametrize(
-    ("measure", "limit"),
-    [(lines_of_code, LINES), (parameters, PARAMETERS), (branches, BRANCHES)],
-    ids=["lines", "parameters", "branches"],
-)
-def test_functions_stay_within(measure, limit):
-    found = {name: measure(*function) for name, function in ALL.items() if name not in ALLOWED}
-    assert {name: size for name, size in found.items() if size > limit} == {}
 
 
 def statements(trees: Iterable[ast.Module]) -> list[int]:
@@ -262,10 +185,6 @@ def test_these_checks_can_fail():
     edges = graph()
     assert "mrt_mitsuba.files.layers" in edges["mrt_mitsuba.rendering.plan"]
     assert "mrt_mitsuba.plugins.variants" in edges["mrt_mitsuba.plugins.light"]
-    body = "\n    ".join(f"if a{i}: pass" for i in range(50))
-    text = f"def f({', '.join(f'a{i}' for i in range(9))}):\n    'Doc.'\n    # why\n\n    {body}"
-    function = ast.parse(text).body[0]
-    assert [measure(function, text) for measure in (lines_of_code, parameters, branches)] == [50, 9, 50]
     packed = ast.parse("'Doc.'\na, b = f(1), 2\nif a:\n    g()")
     assert statements([packed]) == [9, 2, 3]
     assert [swaps(node) for node in packed.body] == [False, True, False]
