@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -23,7 +23,7 @@ from mrt_mitsuba.validation.bsdf_probe import evaluate, lobe_pairs, relative_err
 from mrt_mitsuba.validation.compare import compare, p_values
 from mrt_mitsuba.validation.laws.probe import is_scalar
 from mrt_mitsuba.validation.oracles.reference import smith_g1
-from mrt_mitsuba.validation.scenery import ball_scene
+from mrt_mitsuba.validation.scenery import load_room
 from mrt_mitsuba.validation.study import Study, Values
 from mrt_mitsuba.validation.timing import timed_in_turns
 
@@ -169,9 +169,13 @@ def compare_roughconductor(
     if not 0 < alpha <= 1:
         raise UsageError(f"alpha={alpha!r}: roughconductor is compared for a roughness in (0, 1]")
     runtime.use(runtime.FAST)
-    scenes = [
-        ball_scene(bsdf(alpha, distribution, visible=sample_visible), size=size) for bsdf in (ours, theirs)
-    ]
+    lamp = {"type": "point", "position": [1.5, 4, 1], "intensity": {"type": "rgb", "value": 15.0}}
+
+    def load(bsdf: Callable[..., Values], visible: bool) -> mi.Scene:
+        ball = bsdf(alpha, distribution, visible=visible)
+        return load_room(size, size * 3 // 4, bsdf=ball, lamp=lamp, view={"fov": 30})
+
+    scenes = [load(bsdf, sample_visible) for bsdf in (ours, theirs)]
 
     def render(index: int, turn: int) -> NDArray[np.float32]:
         return np.array(mi.render(scenes[index], spp=spp, seed=derived_seed(seed, side=index + 1, turn=turn)))
@@ -182,7 +186,7 @@ def compare_roughconductor(
     first, second = pictures.mean(axis=1, dtype=np.float64)
     # Drawn from D, whose density is the same in both. A path that rounding sends past the other side of an
     # edge goes on differently; anything else would show in most pixels of the ball
-    plain = (ball_scene(bsdf(alpha, distribution, visible=False), size=size) for bsdf in (ours, theirs))
+    plain = (load(bsdf, False) for bsdf in (ours, theirs))
     one, other = (np.array(mi.render(scene, spp=16, seed=1)) for scene in plain)
     differ = (abs(one - other) > 1e-4 * np.maximum(other, other.mean())).any(axis=-1)
     errors = {
