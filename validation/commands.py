@@ -15,7 +15,7 @@ from mrt_mitsuba.rendering.progress import TerminalProgress
 from mrt_mitsuba.validation.page import prepare_folder
 from mrt_mitsuba.validation.study import Bound
 
-KEYS = ("reference", "cases", "shared", "repeats", "errors")  # of a file of cases
+KEYS = ("reference", "cases", "shared", "repeats")  # of a file of cases
 
 
 def diff(a: str, b: str, *, layer: str = "", out: str | None = None, **limits: str) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import csv
-import html
 import io
 import json
 import os
@@ -64,12 +63,6 @@ def save_report(
     for name, data in _files(studies, title, quick).items():
         with replacing(Path(folder) / name) as (file,):
             file.write(data)
-
-
-def notebook(study: Study, *, title: str) -> str:
-    """Return the page of a study as a frame for a notebook, whose own style it leaves alone."""
-    page = html.escape(_files([study], title)["index.html"].decode())
-    return f'<iframe srcdoc="{page}" style="width: 100%; height: 40rem; border: 1px solid #d5d8dd"></iframe>'
 
 
 @needs_extra()

@@ -13,7 +13,7 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import cycle
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
@@ -28,8 +28,8 @@ from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation import plotting
-from mrt_mitsuba.validation.compare import Array, Difference, compare, read_layer
-from mrt_mitsuba.validation.page import notebook, save_report
+from mrt_mitsuba.validation.compare import Array, compare, read_layer
+from mrt_mitsuba.validation.page import save_report
 from mrt_mitsuba.validation.study import Study, Values
 
 if TYPE_CHECKING:
@@ -38,9 +38,8 @@ if TYPE_CHECKING:
 TITLE = "Error against time"
 MIN_SECONDS = 0.05  # that one timing takes: a shorter render is repeated, and the mean counts
 RESOLVED = 2.0  # an error is known from this many times the reference's own error on
-ERRORS = 4  # number of errors for which the time is given, unless they are chosen
+ERRORS = 4  # number of errors for which the time is given
 MAX_DOUBLINGS = 8  # of the rays of reference="auto"
-NUMBER = r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?:/\d+)?%?"
 MIN_RMSE = 1e-15  # a smaller one is 0, which has no logarithm
 LEVEL = 0.95  # of all intervals
 
@@ -64,11 +63,8 @@ class Point:
     bias: float  #: √(MSE − variance), 0 where noise explains the whole error
     bias_interval: Interval
     efficiency: float  #: 1 / (variance × seconds); NaN where nothing is random
-    cold: float  #: seconds of a first run, its kernels compiled or read from a cache
-    compile: float  #: seconds of that in the compiler
-    rays: Mapping[str, int]
+    cold: float  #: seconds of the first run, its kernels compiled or read from a cache
     image: Array  #: of the first repeat
-    difference: Difference  #: of it from the reference
     reference_error: float
 
     @classmethod
@@ -104,8 +100,7 @@ class Point:
     @property
     def family(self) -> str:
         """The name without its numbers: cases that differ in these alone are one curve."""
-        words = " ".join(re.sub(rf"(?:\b\w+=)?{NUMBER}", " ", self.name).split())
-        return words.strip(" ,") or " ".join(re.sub(f"=?{NUMBER}", " ", self.name).split()) or self.name
+        return re.sub(r"=?[+-]?\d[\w.%/+-]*", "", self.name).strip(" ,") or self.name
 
     @property
     def resolved(self) -> bool:
@@ -114,80 +109,13 @@ class Point:
 
     def row(self) -> Values:
         """Return the row of the table of all cases."""
-
-        def interval(ends: Interval) -> str:
-            return f"{ends[0]:.3g} to {ends[1]:.3g}" if np.isfinite(ends[0]) else "one repeat"
-
-        return {
-            "case": self.name,
-            "seconds": self.seconds,
-            "interval, s": interval(self.seconds_interval),
-            "cold, s": self.cold,
-            "of it compiling, s": self.compile,
-            "RMSE": self.rmse if self.resolved else "not resolved",
-            "interval": interval(self.rmse_interval) if self.resolved else "",
-            "|bias|": self.bias,
-            "interval of it": interval(self.bias_interval),
-            "1 / (variance × s)": self.efficiency,
-            "relMSE": self.difference.rel_mse,
-            "largest": self.difference.largest,
-            "FLIP": self.difference.flip,
-            "rays": sum(self.rays.values()),
-        }
-
-
-@dataclass(frozen=True)
-class Race:
-    """Which curves come down to an error, the fastest first, and when."""
-
-    error: float
-    times: Mapping[str, tuple[float, float, float]]  #: seconds and their interval, by curve
-    case: str  #: the fastest case of the first curve that comes so low
-    doubtful: Mapping[str, float] = field(default_factory=dict)
-    """The least seconds of curves that stay above the error, but may come so low by their intervals."""
-
-    @property
-    def rivals(self) -> list[str]:
-        """Curves whose intervals overlap with that of the first one: then there is no winner."""
-        best, *others = self.times or [""]
-        if not best:
-            return []
-        least = {name: self.times[name][1] for name in others} | dict(self.doubtful)
-        return [name for name, seconds in least.items() if not self.times[best][2] < seconds]
-
-    @property
-    def longer(self) -> float:
-        """How many times as long as the first curve the next one takes."""
-        first, second = [seconds for seconds, *_ in self.times.values()][:2]
-        return second / first
-
-    def __str__(self) -> str:
-        best, *others = self.times or [""]
-        if not best:
-            verdict = "no case comes so low"
-        elif self.rivals:
-            verdict = f"no winner, for the intervals overlap: {'; '.join([best, *self.rivals])}"
-        elif others:
-            longer = f"{self.longer:.2g} times as long"
-            verdict = f"{best} is the fastest, {_shown(*self.times[best])} s; {others[0]} takes {longer}"
-        else:
-            verdict = f"only {best} comes so low, in {_shown(*self.times[best])} s"
-        return f"RMSE of {self.error:g}: {verdict}."
-
-    def row(self) -> Values:
-        """Return the row of the table of what to use."""
-        best, *others = self.times or [""]
-        row: Values = {"error": self.error, "use": self.case or "nothing comes so low"}
-        row |= {
-            "seconds": _shown(*self.times[best]) if best else None,
-            "next best": None,
-            "which takes": None,
-        }
-        if self.rivals:
-            row["use"] = f"no winner: {'; '.join([best, *self.rivals])}"
-        elif others:
-            row |= {"next best": others[0], "which takes": f"{self.longer:.2g} times as long"}
-        return row
+        row: Values = {"case": self.name, "seconds": self.seconds}
+        row |= {"interval, s": _interval(*self.seconds_interval), "cold, s": self.cold}
+        row |= {"RMSE": "not resolved", "interval": "", "|bias|": "", "interval of it": ""}
+        if self.resolved:
+            row |= {"RMSE": self.rmse, "interval": _interval(*self.rmse_interval)}
+            row |= {"|bias|": self.bias, "interval of it": _interval(*self.bias_interval)}
+        return row | {"1 / (variance × s)": self.efficiency}
 
 
 @dataclass(frozen=True)
@@ -200,8 +128,7 @@ class Findings:
     reference: Array
     reference_error: float  #: RMSE of the reference itself, below which nothing is claimed; 0: exact
     repeats: int
-    errors: Sequence[float]  #: for which the time is given
-    took: float = 0.0
+    took: float = 0.0  #: seconds, in all
 
     @property
     def families(self) -> dict[str, list[Point]]:
@@ -212,18 +139,25 @@ class Findings:
         return groups
 
     @property
+    def errors(self) -> list[float]:
+        """RMSEs over the range that was measured, for which the time is given."""
+        known = [p.rmse for p in self.points.values() if p.resolved and p.rmse > 1e-9]
+        if not known:
+            return []
+        inside = np.geomspace(max(known), min(known), ERRORS + 2)[1:-1]
+        # rounded up, so that there is a case that comes so low
+        return list(dict.fromkeys(float(f"{1.05 * e:.1e}") for e in inside))
+
+    @property
     def warning(self) -> str:
         """What the reference is too coarse for; "" if nothing."""
-        coarse = [
-            point.name
-            for point in self.points.values()
-            if not point.resolved and max(point.rmse, self.reference_error) > 0
-        ]
+        own = self.reference_error
+        coarse = [p.name for p in self.points.values() if not p.resolved and max(p.rmse, own) > 0]
         if not coarse:
             return ""
         return (
-            f"The reference is too coarse, its own RMSE is {self.reference_error:.2g}: nothing can be said "
-            f'about {", ".join(coarse)}; use more rays for it, or reference="auto".'
+            f"The reference is too coarse, its own RMSE is {own:.2g}: nothing can be said about "
+            f'{", ".join(coarse)}; use more rays for it, or reference="auto".'
         )
 
     def time_to(self, error: float) -> dict[str, tuple[float, float, float]]:
@@ -238,17 +172,28 @@ class Findings:
             times[name] = tuple(_crossing(*curve, error) for curve in zip(seconds, errors, strict=True))
         return times
 
-    def race(self, error: float) -> Race:
-        """Which curves come down to an error, and when."""
-        every = self.time_to(error)
-        times = {name: t for name, t in every.items() if math.isfinite(t[0])}
-        times = dict(sorted(times.items(), key=lambda item: item[1]))
-        doubtful = {name: t[1] for name, t in every.items() if name not in times and math.isfinite(t[1])}
-        case = ""
-        if times:
-            points = self.families[next(iter(times))]  # the fastest first
-            case = next(p.name for p in points if p.rmse <= error * (1 + 1e-9))
-        return Race(error, times, case, doubtful)
+    def race(self, error: float) -> Values:
+        """Return which case is the fastest to an error, how long it takes, and what comes next.
+
+        There is no winner where the intervals of other curves overlap with that of the first.
+        """
+        (best, times), *others = sorted(self.time_to(error).items(), key=lambda item: item[1])
+        rivals = [name for name, (_, least, _) in others if not times[2] < least]
+        row: Values = {"error": error, "use": "nothing comes so low", "seconds": None}
+        row |= {"next best": None, "times as long": None}
+        if math.isinf(times[0]):
+            return row
+        row["seconds"] = _shown(*times)
+        if rivals:
+            return row | {"use": f"no winner: {'; '.join([best, *rivals])}"}
+        row["use"] = next(p.name for p in self.families[best] if p.rmse <= error * (1 + 1e-9))
+        if others and math.isfinite(others[0][1][0]):
+            row |= {"next best": others[0][0], "times as long": others[0][1][0] / times[0]}
+        return row
+
+    def advice(self) -> list[Values]:
+        """Return a row for each of ``errors``, see ``race``."""
+        return [self.race(error) for error in self.errors]
 
     @property
     def verdicts(self) -> list[str]:
@@ -257,39 +202,33 @@ class Findings:
             return ["No verdict on time: a single repeat has no interval."]
         if self.points and not self.errors:
             return ["No verdict on time: no case has an error that the reference can resolve."]
-        return [str(self.race(error)) for error in self.errors]
-
-    def advice(self) -> list[Values]:
-        """Return a row for each of ``errors``: the case that gets there first, and the next other curve."""
-        return [self.race(error).row() for error in self.errors]
+        sentences = []
+        for row in self.advice():
+            sentence = f"RMSE of {row['error']:g}: {row['use']}"
+            if row["seconds"]:
+                sentence += f", {row['seconds']} s"
+            if row["next best"]:
+                sentence += f"; {row['next best']} takes {row['times as long']:.2g} times as long"
+            sentences.append(f"{sentence}.")
+        return sentences
 
     def __str__(self) -> str:
         width = max(map(len, [*self.points, *self.failed]), default=0)
         lines = [self.warning] if self.warning else []
-        lines += [
-            f"{p.name:<{width}}  {_shown(p.seconds, *p.seconds_interval)} s, "
-            f"RMSE {_shown(p.rmse, *p.rmse_interval)}"
-            for p in self.points.values()
-        ]
+        for p in self.points.values():
+            error = _shown(p.rmse, *p.rmse_interval)
+            lines.append(f"{p.name:<{width}}  {_shown(p.seconds, *p.seconds_interval)} s, RMSE {error}")
         lines += [f"{name:<{width}}  FAILED {why}" for name, why in self.failed.items()]
         own = f"{self.reference_error:.2g}" if self.reference_error else "not known"
         return "\n".join([*lines, f"the reference's own error: {own}", *self.verdicts])
 
-    def study(self) -> Study:
-        """Return the findings in the form that pages are made of."""
-        scene = f"scene {self.scene}" if self.scene.isdigit() else self.scene
-        study = Study("error-vs-time", f"{TITLE}: {scene}", seconds=self.took)
-        describe(study, self, "", "All cases")
-        return study
-
     @needs_extra()
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write the page (``index.html``), ``summary.json``, CSV files and plots. Raises ``OutputError``."""
-        save_report(folder, self.study(), title=TITLE)
-
-    @needs_extra()
-    def _repr_html_(self) -> str:
-        return notebook(self.study(), title=TITLE)
+        scene = f"scene {self.scene}" if self.scene.isdigit() else self.scene
+        study = Study("error-vs-time", f"{TITLE}: {scene}", seconds=self.took)
+        describe(study, self, "All cases")
+        save_report(folder, study, title=TITLE)
 
 
 def _reach(values: Array) -> float:
@@ -315,10 +254,12 @@ def _crossing(seconds: Array, errors: Array, error: float) -> float:
     return float(np.exp(np.interp(-math.log(error * (1 + 1e-9)), depths, times, right=math.inf)))
 
 
+def _interval(low: float, high: float) -> str:
+    return "" if math.isnan(low) else f"({low:.3g} to {high:.3g})"
+
+
 def _shown(value: float, low: float, high: float) -> str:
-    if math.isinf(value):
-        return "not reached"
-    return f"{value:.3g}" if math.isnan(low) else f"{value:.3g} ({low:.3g} to {high:.3g})"
+    return f"{value:.3g} {_interval(low, high)}".strip()
 
 
 # ----------------------------------------------- Reference -----------------------------------------------
@@ -329,39 +270,28 @@ Truth = tuple[Array, Array, float]  # two independent halves, or twice the same 
 
 def _automatic(run: Run, cases: Mapping[str, Options], step: int) -> Truth:
     """Render the scene by its own integrator, with more rays than the cases, doubled ``step`` times."""
-    spp = 2 * max(int(case.get("spp") or 16) for case in cases.values())
-    truth = _halves(run, {"aamode": "none", "target": None, "spp": spp * 2**step})
-    if truth[2]:
-        return truth
-    aa = 2 * max(int(case.get("aa") or 4) for case in cases.values()) * 2**step
-    lattice = {"aamode": "none", "lattice": "centered"}
-    return _difference(run, [{**lattice, "aa": aa}, {**lattice, "aa": aa * 3 // 4}])
+    uniform = {"aamode": "none", "target": None}
+    if run(uniform, 0).options["lattice"] == "film":
+        spp = max(int(case.get("spp") or 16) for case in cases.values())
+        return _rendered(run, {**uniform, "spp": 2 * spp * 2**step})
+    aa = max(int(case.get("aa") or 4) for case in cases.values())
+    return _rendered(run, {**uniform, "lattice": "centered", "aa": 2 * aa * 2**step})
 
 
-def _given(reference: Given, run: Run) -> Truth:
-    """Render or read a reference, see ``error_vs_time``."""
-    if isinstance(reference, Mapping):
-        truth = _halves(run, reference)
-        aa = run(reference, 0).options["aa"] if not truth[2] else 1
-        return truth if aa == 1 else _difference(run, [reference, {**reference, "aa": aa - 1}])
-    if isinstance(reference, Sequence) and not isinstance(reference, str):
-        return _difference(run, reference)
-    picture, variance, _ = read_layer(reference)
-    return picture, picture, 0.0 if variance is None else float(variance.mean()) ** 0.5
+def _rendered(run: Run, options: Options) -> Truth:
+    """Render half of the rays twice, with other seeds; where nothing is random, ``aa`` and a quarter less.
 
-
-def _halves(run: Run, options: Options) -> Truth:
-    """Render half of the rays twice, with other seeds."""
+    Odd multiples of an ``aa`` share samples, and with them errors.
+    """
     spp = int(options.get("spp") or 1)
     half = {**options, "spp": spp // 2} if spp > 1 else options
-    first, second = (_picture(run(half, derived_seed(0, reference=part))) for part in (1, 2))
-    return first, second, compare(first, second).rmse / 2
-
-
-def _difference(run: Run, options: Sequence[Options]) -> Truth:
-    """Render the better options and others, whose difference bounds the error."""
-    first, second = (_picture(run(one, derived_seed(0, reference=1))) for one in options)
-    return first, first, compare(first, second).rmse
+    results = [run(half, derived_seed(0, reference=part)) for part in (1, 2)]
+    first, second = map(_picture, results)
+    aa = results[0].options["aa"]
+    if aa == 1 or not np.array_equal(first, second):
+        return first, second, compare(first, second).rmse / 2
+    coarse = _picture(run({**options, "aa": aa * 3 // 4}, 0))
+    return first, first, compare(first, coarse).rmse
 
 
 def _picture(result: Result) -> Array:
@@ -382,8 +312,6 @@ def error_vs_time(
     reference: Given = "auto",
     repeats: int = 5,
     shared: Options | None = None,
-    errors: Sequence[float] | None = None,
-    cold: bool = True,
     progress: Progress | None = None,
 ) -> Findings:
     """Measure the error and the time of settings of ``render``.
@@ -395,14 +323,11 @@ def error_vs_time(
         reference: "auto" renders the scene by its own integrator, with more and more rays until the error of
             each case is at least twice the reference's own. Or options that give the truth: where something
             is random, it is rendered as two halves of its ``spp``, with other seeds, and their difference is
-            its own error; elsewhere a render with ``aa`` less by one is compared. Two sets of options, the
-            better first: what they differ by bounds the error of the first. Or a picture: an array, the path
-            of an EXR or a ``Result``, whose error is read from its layer "error".
-        repeats: with other seeds, in turn, after a cold and a warm run of each case. A render of less than
-            0.05 s is timed as the mean of several.
+            its own error; elsewhere a render with an ``aa`` less by a quarter is compared. Or a picture: an
+            array, the path of an EXR or a ``Result``, whose error is read from its layer "error".
+        repeats: with other seeds, in turn, after a first run of each case. A render of less than 0.05 s is
+            timed as the mean of several.
         shared: options of all cases and of the reference.
-        errors: RMSEs to give the time for; by default four over the range that was measured.
-        cold: whether the kernels of each case are compiled anew for its first run, which takes longer.
 
     A case that fails is kept, with the reason. Warns where a reference is too coarse for a case. Raises
     ``UsageError`` for wrong arguments, and what ``render`` raises for the reference.
@@ -416,21 +341,21 @@ def error_vs_time(
             raise UsageError(f"{name} sets a seed: repeats have seeds of their own; leave it out")
     run = _runner(scene, shared)
     automatic = isinstance(reference, str) and reference == "auto"
-    *halves, own_error = _automatic(run, cases, 0) if automatic else _given(reference, run)
-    needed = min(errors or (math.inf,)) / RESOLVED
-    if needed <= own_error and not automatic:
-        raise UsageError(
-            f"no claim can be made about an RMSE of {min(errors or ()):g}: the reference's own error is "
-            f"{own_error:.2g}, and only errors above twice that stand out; take a better reference"
-        )
-    runs, failed = _measure(run, cases, halves[0], repeats, cold, progress or Progress())
-    points = _points(runs, repeats, halves, own_error)
+    if automatic:
+        *halves, own_error = _automatic(run, cases, 0)
+    elif isinstance(reference, Mapping):
+        *halves, own_error = _rendered(run, reference)
+    else:
+        picture, variance, _ = read_layer(reference)
+        halves = [picture, picture]
+        own_error = 0.0 if variance is None else float(variance.mean()) ** 0.5
+    runs, failed = _measure(run, cases, halves[0], repeats, progress or Progress())
+    points = _points(runs, halves, own_error)
     for step in range(1, MAX_DOUBLINGS + 1 if automatic else 1):
-        least = min((p.rmse for p in points.values() if p.rmse), default=math.inf)
-        if own_error < min(needed, least / RESOLVED):
+        if own_error < min((p.rmse for p in points.values() if p.rmse), default=math.inf) / RESOLVED:
             break
         *halves, own_error = _automatic(run, cases, step)
-        points = _points(runs, repeats, halves, own_error)
+        points = _points(runs, halves, own_error)
     found = Findings(
         scene=next((result.plan.scene for (result, _), *_ in runs.values()), "scene"),
         points=points,
@@ -438,22 +363,11 @@ def error_vs_time(
         reference=np.mean(halves, axis=0),
         reference_error=own_error,
         repeats=repeats,
-        errors=list(_errors(points) if errors is None else errors),
         took=time.perf_counter() - start,
     )
     if found.warning:
         warnings.warn(found.warning, MrtWarning, stacklevel=2)
     return found
-
-
-def _errors(points: Mapping[str, Point]) -> list[float]:
-    """Return errors over the range that was measured, to give the time for."""
-    known = [p.rmse for p in points.values() if p.resolved and p.rmse > 1e-9]
-    if not known:
-        return []
-    inside = np.geomspace(max(known), min(known), ERRORS + 2)[1:-1]
-    # rounded up, so that there is a case that comes so low
-    return list(dict.fromkeys(float(f"{1.05 * e:.1e}") for e in inside))
 
 
 def _runner(scene: Given, shared: Options) -> Run:
@@ -479,31 +393,23 @@ def _runner(scene: Given, shared: Options) -> Run:
 
 
 def _measure(
-    run: Run, cases: Mapping[str, Options], truth: Array, repeats: int, cold: bool, progress: Progress
+    run: Run, cases: Mapping[str, Options], truth: Array, repeats: int, progress: Progress
 ) -> tuple[dict[str, list[Timed]], dict[str, str]]:
-    """Return the results of cases, the last ``repeats`` of which count, and why others failed.
+    """Return the results of cases, of a first run and ``repeats``, and why others failed.
 
-    Each runs first, perhaps with its kernels compiled anew and once more, then ``repeats`` times in turn, so
-    that a load on the machine meets all alike.
+    Repeats take turns, so that a load on the machine meets all alike.
     """
-    import drjit as dr
-
     failed: dict[str, str] = {}
     runs: dict[str, list[Timed]] = {name: [] for name in cases}
-    first = -2 if cold else -1
-    with progress.stage(TITLE, len(cases) * (repeats - first)) as advance:
-        for turn in range(first, repeats):
+    with progress.stage(TITLE, len(cases) * (repeats + 1)) as advance:
+        for turn in range(-1, repeats):
             for name in list(runs):
                 try:
-                    if cold and turn == first:
-                        dr.flush_kernel_cache()
                     seconds: list[float] = []
                     while not seconds or (turn >= 0 and sum(seconds) < MIN_SECONDS):
                         result = run(cases[name], derived_seed(0, repeat=max(turn, 0)))
                         seconds.append(result.timings.total - result.timings.load)
-                    picture = _picture(result)
-                    if turn == first:
-                        compare(picture, truth)  # raises for another size
+                    compare(_picture(result), truth)  # raises for another size
                     runs[name].append((result, float(np.mean(seconds))))
                 except Exception as error:
                     failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -513,27 +419,17 @@ def _measure(
 
 
 def _points(
-    runs: Mapping[str, Sequence[Timed]], repeats: int, halves: Sequence[Array], own_error: float
+    runs: Mapping[str, Sequence[Timed]], halves: Sequence[Array], own_error: float
 ) -> dict[str, Point]:
-    """Return the figures of cases, by name; their first run was cold, their last ``repeats`` count."""
+    """Return the figures of cases, by name; their first run, which compiles, does not count."""
     points = {}
-    for name, timed in runs.items():
-        results, seconds = zip(*timed, strict=True)
-        counted = results[-repeats:]
-        pictures = np.array([result.image for result in counted], np.float64)  # [repeats, H, W, 3]
+    for name, (first, *counted) in runs.items():
+        pictures = np.array([result.image for result, _ in counted], np.float64)  # [repeats, H, W, 3]
         errors = [(pictures - half).reshape(len(pictures), -1) for half in halves]
         gram = errors[0] @ errors[1].T / errors[0].shape[1]
-        points[name] = Point.of(
-            name,
-            np.array(seconds[-repeats:]),
-            (gram + gram.T) / 2,
-            cold=seconds[0],
-            compile=results[0].timings.compile,
-            rays=dict(counted[0].rays),
-            image=counted[0].image,
-            difference=compare(counted[0].image, np.mean(halves, axis=0)),
-            reference_error=own_error,
-        )
+        seconds = np.array([taken for _, taken in counted])
+        more = {"cold": first[1], "image": counted[0][0].image, "reference_error": own_error}
+        points[name] = Point.of(name, seconds, (gram + gram.T) / 2, **more)
     return points
 
 
@@ -566,10 +462,11 @@ def diagram(title: str, found: Findings) -> Figure:
         at = np.array([(p.seconds, max(p.rmse, bottom)) for p in curve])  # [points, 2]
         ends = np.array([(p.seconds_interval, p.rmse_interval) for p in curve])  # [points, 2, 2]
         bars = np.nan_to_num(abs(ends - at[:, :, None])).transpose(1, 2, 0)
-        look: Any = {"marker": marker, "color": colors.get(family, plotting.GREY), "elinewidth": 0.8}
-        look |= {"linewidth": 1.6, "markersize": 5} if family in colors else {"alpha": 0.7, "markersize": 3}
+        color = colors.get(family, plotting.GREY)
         x, y = at.T
-        axes.errorbar(x, y, bars[1], bars[0], label=family, **look)
+        axes.errorbar(
+            x, y, bars[1], bars[0], label=family, color=color, marker=marker, markersize=4, elinewidth=0.8
+        )
     if found.reference_error:
         label = "within the reference's own error"
         axes.axhspan(bottom / 10, found.reference_error, color="0.9", zorder=0, label=label)
@@ -581,14 +478,13 @@ def diagram(title: str, found: Findings) -> Figure:
     return drawn
 
 
-def describe(study: Study, found: Findings, name: str, title: str, truth: str = "") -> None:
-    """Add the diagram, the answers and the tables to a study; ``truth`` says what the reference is."""
+def describe(study: Study, found: Findings, title: str, name: str = "") -> None:
+    """Add the diagram, the answers and the tables to a study, under names that start with ``name``."""
     prefix = name and f"{name}-"
-    where = name and f"{name}: "
-    study.at_most(f"{where}cases that failed", len(found.failed), 0, "each of them could be rendered")
-    if found.failed:
-        reasons = [{"case": case, "why": why} for case, why in found.failed.items()]
-        study.records(f"{prefix}failed", f"{title}: cases that failed", reasons)
+    failed = [{"case": case, "why": why} for case, why in found.failed.items()]
+    study.at_most(f"cases that failed: {title}", len(failed), 0, "each of them could be rendered")
+    if failed:
+        study.records(f"{prefix}failed", f"{title}: cases that failed", failed)
     if not found.points:
         return
     if found.warning:
@@ -596,12 +492,11 @@ def describe(study: Study, found: Findings, name: str, title: str, truth: str = 
     own = f"about {found.reference_error:.2g}" if found.reference_error else "not known"
     caption = (
         "Down and to the left is better. Yellow: the best at each error; grey: curves that are never the "
-        f"best. Bars: 95 % intervals. Reference: {truth or 'as given'}; its own RMSE is {own}. "
+        f"best. Bars: 95 % intervals. The reference's own RMSE is {own}. "
     )
-    caption += " ".join(found.verdicts)
-    study.picture(f"{prefix}diagram", title, diagram(title, found), caption)
+    study.picture(f"{prefix}diagram", title, diagram(title, found), caption + " ".join(found.verdicts))
     if found.errors:
         study.records(f"{prefix}advice", f"{title}: what to use", found.advice(), first=not name)
-    note = "Medians of warm renders without loading the scene; cold: a first run. Errors in linear light."
+    note = "Medians of warm renders without loading the scene; cold: the first run. Errors in linear light."
     points = [point.row() for curve in found.families.values() for point in curve]
     study.records(f"{prefix}points", f"{title}: every case", points, note)

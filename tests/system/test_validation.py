@@ -22,7 +22,7 @@ from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.oracles.reference import reference_render
 from mrt_mitsuba.validation.scenery import sensor, with_materials
-from mrt_mitsuba.validation.studies import error_vs_time, roughconductor, scenes
+from mrt_mitsuba.validation.studies import roughconductor, scenes
 from mrt_mitsuba.validation.study import Study, findings
 
 for needed in cli.EXTRAS:
@@ -38,8 +38,6 @@ Fault = Callable[[Patch], None]
 def tiny(monkeypatch: Patch, variant: str) -> None:
     """Let studies measure as little as shows whether their bounds hold."""
     monkeypatch.setattr(roughconductor.runtime, "usable_variants", lambda: ["llvm_ad_rgb"])
-    # kernels are compiled anew for the first run of a case in tests of mrt.error_vs_time
-    monkeypatch.setattr(error_vs_time, "QUICK", dataclasses.replace(error_vs_time.QUICK, cold=False))
 
 
 def quick(name: str) -> Study:

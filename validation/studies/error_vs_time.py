@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mitsuba as mi
@@ -22,10 +22,7 @@ Number = int | str  # of a scene of the report, or ``BOX``
 
 @dataclass(frozen=True)
 class Cost:
-    """How much to measure; in full by default.
-
-    References take even multiples of each amount, since odd ones share samples and with them errors.
-    """
+    """How much to measure; in full by default."""
 
     size: tuple[int, int] = (400, 300)  #: of pictures, pixels
     path_size: tuple[int, int] = (240, 180)  #: of those that paths make
@@ -38,8 +35,6 @@ class Cost:
     targets: tuple[str, ...] = ("4%", "2%", "1%")
     samplers: tuple[str, ...] = SAMPLERS
     sampler_counts: tuple[int, ...] = (4, 16, 64)
-    lattices: tuple[str, ...] = ("report", "centered")  #: of pixels that are refined
-    cold: bool = True  #: with every case's kernels compiled anew
 
 
 QUICK = Cost(
@@ -63,8 +58,6 @@ DOCS = Cost(
     rounds=(16,),
     targets=("8%", "4%"),
     sampler_counts=(4, 16),
-    lattices=("centered",),
-    cold=False,
 )
 # Widths of scenes in the documentation, at which 16 rays in each pixel take some 50 ms
 WIDTHS: dict[Number, int] = {0: 384, 1: 336, 2: 300, 3: 252, 4: 192}
@@ -76,39 +69,13 @@ def shown(scene: Number) -> Cost:
     return replace(DOCS, size=(width, width * 3 // 4))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Trade:
-    """Settings to compare in a scene."""
-
-    title: str  #: of the settings
-    truth: str  #: what the reference is
-    scene: Values
-    cases: dict[str, Values]
-    reference: Any
-    shared: Values = field(default_factory=dict)
-
-    def measure(self, cost: Cost) -> Findings:
-        """Render all cases."""
-        return error_vs_time(
-            self.scene,
-            self.cases,
-            reference=self.reference,
-            shared=self.shared,
-            repeats=cost.repeats,
-            cold=cost.cold,
-        )
-
-
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
-    cost = QUICK if quick else Cost()
-    jobs = [(name, number) for name in TRADES for number in ((0,) if quick else SCENES[name])]
+    jobs = [(name, number) for name in MEASURED for number in ((0,) if quick else SCENES[name])]
     for name, number in study.each("Error against time", jobs):
-        trade = TRADES[name](number, cost)
-        found = trade.measure(cost)
-        where = f"{title_of(number).lower()}, {name}"
-        describe(study, found, where, f"{title_of(number)}: {trade.title}", trade.truth)
-        del trade, found  # what holds them is freed with them
+        found = MEASURED[name](number, QUICK if quick else Cost())
+        describe(study, found, f"{title_of(number)}: {TITLES[name]}", f"{title_of(number).lower()}, {name}")
+        del found  # what it holds is freed with it
 
 
 def choices(number: Number, cost: Cost) -> dict[str, Findings]:
@@ -117,15 +84,12 @@ def choices(number: Number, cost: Cost) -> dict[str, Findings]:
     ``mrt_whitted`` and ``path`` converge to pictures of their own. The Cornell box has paths alone; scenes
     whose highlights are so narrow that rare paths dominate the error have none.
     """
-    titles = {}
-    if number != BOX:
-        titles["sampling"] = "rays as in the report"
+    found = {}
+    if isinstance(number, int):
+        found[f"{title_of(number)}, rays as in the report"] = sampling(number, cost)
     if number == BOX or number in CALM:
-        titles["path"] = "light paths"
-    return {
-        f"{title_of(number)}, {title}": TRADES[name](number, cost).measure(cost)
-        for name, title in titles.items()
-    }
+        found[f"{title_of(number)}, light paths"] = path(number, cost)
+    return found
 
 
 def advice(panels: Mapping[str, Findings]) -> list[Values]:
@@ -141,11 +105,11 @@ def title_of(number: Number) -> str:
     return f"Scene {number}" if isinstance(number, int) else number
 
 
-def _scene(number: Number, size: tuple[int, int], **options: Any) -> Values:
+def _scene(number: Number, size: tuple[int, int]) -> Values:
     """Return a scene of the report, or Mitsuba's Cornell box, as a dict."""
     width, height = size
     if isinstance(number, int):
-        return mrt.scene_dict(number, width=width, height=height, **options)
+        return mrt.scene_dict(number, width=width, height=height)
     box = mi.cornell_box()
     box["sensor"]["film"] |= {"width": height, "height": height}
     return box
@@ -154,46 +118,36 @@ def _scene(number: Number, size: tuple[int, int], **options: Any) -> Values:
 def _rounds(cost: Cost, **options: Any) -> dict[str, Values]:
     """Return adaptive renders, of a number of rays or to an error."""
     own = {"aa": None, "lattice": None, **options}
-    most = 4 * max(cost.rounds, default=1)
     cases = {f"adaptive, spp={spp}": {**own, "aamode": "noise", "spp": spp} for spp in cost.rounds}
-    aims = {f"adaptive to a target, {aim}": {**own, "aamode": None, "target": aim} for aim in cost.targets}
-    return cases | {name: {**case, "maxspp": most} for name, case in aims.items()}
+    for target in cost.targets:
+        case = {**own, "aamode": None, "target": target, "maxspp": 4 * max(cost.rounds)}
+        cases[f"adaptive to a target, {target}"] = case
+    return cases
 
 
 MODES = {"none": "every pixel", "luma": "luma edges", "sobel": "Sobel edges", "geometry": "geometry edges"}
-LATTICES = {"report": "report's lattice", "centered": "centred"}
 
 
-def sampling(number: int, cost: Cost) -> Trade:
-    """Compare the modes of anti-aliasing, numbers of samples and lattices."""
-
-    def name(lattice: str, mode: str, aa: int) -> str:
-        return f"{LATTICES[lattice]}, {MODES[mode]}, aa={aa}"
-
-    cases = {
-        name(lattice, mode, aa): {"aa": aa, "aamode": mode, "lattice": lattice, "focaldist": 0}
-        for lattice in LATTICES
-        for mode in MODES
-        for aa in cost.amounts
-        if mode == "none" or (aa > 1 and lattice in cost.lattices)
-    }
-
-    truth = {"aamode": "none", "lattice": "centered", "focaldist": 0}
-    return Trade(
-        title="anti-aliasing mode, aa and lattice",
-        truth=f"{cost.most}x{cost.most} centered samples a pixel; its error: that of three quarters of them",
-        scene=_scene(number, cost.size),
-        cases=cases | _rounds(cost, focaldist=0),
-        reference=[{**truth, "aa": aa} for aa in (cost.most, cost.most * 3 // 4)],
-    )
+def sampling(number: int, cost: Cost) -> Findings:
+    """Measure numbers of samples on both lattices, modes of anti-aliasing, and adaptive sampling."""
+    cases = _rounds(cost, focaldist=0)
+    for aa in cost.amounts:
+        shared = {"aa": aa, "focaldist": 0}
+        cases[f"report's lattice, aa={aa}"] = {**shared, "aamode": "none", "lattice": "report"}
+        for mode, title in MODES.items():
+            if mode == "none" or aa > 1:
+                cases[f"{title}, aa={aa}"] = {**shared, "aamode": mode, "lattice": "centered"}
+    truth = {"aa": cost.most, "aamode": "none", "lattice": "centered", "focaldist": 0}
+    return error_vs_time(_scene(number, cost.size), cases, reference=truth, repeats=cost.repeats)
 
 
-def path(number: Number, cost: Cost) -> Trade:
-    """Compare Mitsuba's path and direct at rising spp, and mrt_whitted, with a converged path."""
+def path(number: Number, cost: Cost) -> Findings:
+    """Measure Mitsuba's path and direct with its samplers, and mrt_whitted, against a converged path."""
     nodes = _scene(number, cost.path_size)
     calm = number in CALM
-    kinds = ("path", "direct") if calm else ("path",)
-    cases = {f"{kind}, spp={spp}": {"integrator": kind, "spp": spp} for kind in kinds for spp in cost.counts}
+    cases = _rounds(cost, integrator="path")
+    for kind in ("path", "direct") if calm else ("path",):
+        cases |= {f"{kind}, spp={spp}": {"integrator": kind, "spp": spp} for spp in cost.counts}
     for sampler in cost.samplers:
         sensor = nodes["sensor"] | {"sampler": {"type": sampler}}
         own = {"scene": nodes | {"sensor": sensor}, "integrator": "path"}
@@ -201,18 +155,20 @@ def path(number: Number, cost: Cost) -> Trade:
     if calm and cost.counts:
         cases["mrt_whitted"] = {}
         cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
-
-    return Trade(
-        title="Whitted, direct and path at rising spp",
-        truth=f"path with spp={cost.path_spp}",
-        scene=nodes,
-        cases=cases | _rounds(cost, integrator="path"),
+    return error_vs_time(
+        nodes,
+        cases,
         reference={"integrator": "path", "spp": cost.path_spp},
         shared={"aa": 1, "aamode": "none"},
+        repeats=cost.repeats,
     )
 
 
-TRADES: dict[str, Callable[[Any, Cost], Trade]] = {"sampling": sampling, "path": path}
+MEASURED: dict[str, Callable[[Any, Cost], Findings]] = {"sampling": sampling, "path": path}
+TITLES = {
+    "sampling": "anti-aliasing mode, aa and lattice",
+    "path": "Whitted, direct and path at rising spp, against a converged path",
+}
 ALL = (0, 1, 2, 3, 4, 7, 9)
 # Under path, scenes of broad highlights: elsewhere rare, very bright paths dominate every mean square
 CALM = (0, 7, 9)
