@@ -284,7 +284,7 @@ def test_a_relative_target_is_a_share_of_the_mean_luminance():
     assert f"5% of the mean luminance, {target:.3g}" in str(result.plan)
     assert result.header()["mrt:error"]["target"] == target
     assert_array_equal(result.image, mrt.render(scene, target=target).image)
-    inside = {"type": "mrt_adaptive", "target": "5%", "nested": {"type": "path", "max_depth": 4}}
+    inside = {"type": "mrt_adaptive", "target": "5%", "nested": {"type": "path", "max_depth": 5}}
     found = np.array(mi.render(scene, integrator=mi.load_dict(inside)))
     assert_array_equal(found[..., :3], result.image)
 
