@@ -311,7 +311,7 @@ for missing, tried in CASES:
 """
 HERE = ["check", "page", "compare", "errors", "rough"]  # doors that need no other process
 CLOSED = """
-jinja2 closes errors
+jinja2 closes check page errors
 scipy closes check page errors
 matplotlib closes compare errors
 dask closes sweep

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -70,20 +71,18 @@ def test_a_sound_scene(scene, capsys, tmp_path):
     assert "SmoothDiffuse paint" in (tmp_path / "out" / "index.html").read_text()
 
 
-def test_the_pixel_and_its_object_are_found(scene, capsys, monkeypatch):
+def test_the_pixel_is_found(scene, capsys, monkeypatch):
     poisoned()
     path = scene("poisoned")
     found = mrt.check_scene(path, quick=True)
     assert set(found.failed) == {"BSDF Changed paint: finite", "pixels"}, str(found)
-    assert found.fault.crop[2:] == (1, 1)
-    assert found.fault.culprit == "the BSDF Changed 'paint', on Sphere 'ball'"
-    x, y = found.fault.crop[:2]
-    assert abs(x - 12) <= 2 and abs(y - 8) <= 2  # the middle of the picture is seen along the normal
-    assert "the smallest crop: 1x1" in str(found)
+    count, x, y = map(int, re.findall(r"\d+", found.fault))
+    assert count and abs(x - 12) <= 2 and abs(y - 8) <= 2  # the middle is seen along the normal
+    assert found.fault in str(found)
     monkeypatch.setattr(mrt, "check_scene", lambda *_, **__: found)
     assert cli.main(["check", path, "quick=1"]) == 1
-    assert "the smallest crop: 1x1" in capsys.readouterr().out
-    assert "Made by the BSDF" in found._repr_html_()
+    assert found.fault in capsys.readouterr().out
+    assert found.fault in found._repr_html_()
 
 
 @pytest.mark.slow
@@ -101,7 +100,6 @@ def test_a_light_that_is_no_number_and_instances():
     }
     found = mrt.check_scene(mi.load_dict(nodes), quick=True)
     assert found.failed == ["emitter PointLight lamp: finite", "pixels"], str(found)
-    assert found.fault.culprit == "the emitter PointLight 'lamp'"
     assert found.left_out == ("1 instances are not checked: give a dict of one with its group",)
     instance = {"type": "instance", "to_world": place, "g": group}
     assert mrt.check_shape(instance, quick=True).failed == ["scale"]
@@ -132,10 +130,11 @@ def test_a_scene_is_checked_as_it_is_rendered(monkeypatch):
     """Options are those of ``render``."""
     seen = []
 
-    def hunt(shot, *_):
-        seen.append((shot.integrator.class_name(), list(shot.sensor.film().size())))
+    def bad_pixels(scene, integrator, sensor, *_):
+        seen.append((integrator.class_name(), list(sensor.film().size())))
+        return ""
 
-    monkeypatch.setattr(checks, "_hunt", hunt)
+    monkeypatch.setattr(checks, "_bad_pixels", bad_pixels)
     monkeypatch.setattr(checks, "check_emitter", lambda *_, **__: Check("", "", {}, 0.0))
     mrt.check_scene(3, width=80, height=30, aa=2)
     ball = {"type": "scene", "ball": {"type": "sphere"}, "sensor": {"type": "perspective"}}

@@ -185,7 +185,6 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
     program: Callable[..., str] | None = None  # writes snippets, while the law is checked
     output: str = ""  # what the snippet of the worst criterion prints, where the law fails
-    plot: Callable[[], Any] | None = None  # makes a figure of matplotlib that shows the failure
 
     def check(
         self,
