@@ -32,7 +32,7 @@ def run(study: Study, *, quick: bool) -> None:
             if case.limit is None:
                 rows.append(row | {"bound": "-", "": "cannot hold"})
             else:
-                bound = Bound(f"{title}: {case.name}", measured, case.limit, case.at_most, case.why)
+                bound = Bound(f"{title}: {case.name}", measured, case.limit, note=case.why)
                 study.bounds.append(bound)
                 rows.append(row | {"bound": f"{bound.sign} {bound.limit:.3g}", "": bound.verdict})
         study.records(table, title, rows, note)
