@@ -1,19 +1,19 @@
 """Check a GPU: compare pictures with another variant's, and run the device tests in processes of their own.
 
 ``make device-check`` runs it in ``cuda_ad_rgb`` against ``llvm_ad_rgb``. Where pictures differ, it names the
-worst pixel and the first layer that differs there.
+worst pixel and follows its samples ray by ray, both variants from the same ray, to the first value that
+differs.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import re
-import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,32 +29,89 @@ SECONDS = 300  # after which nothing more is started
 ROUNDING = 2e-4  # relative, of float32 values computed in another order of operations
 TURNED = 0.01  # fraction of pixels that may differ by more: a rounding decides at edges and shadow borders
 MEAN = 1e-4  # mean difference of pictures, in linear values
-LAYERS = ("depth", "normal", "albedo", "direct", "reflection", "bounces")  # in the order of their making
+AA = 4
+BOUNCES = 10
 BOX = "cornell"
+Values = dict[str, np.ndarray]
 
 
-def picture(name: str, variant: str, size: dict[str, int]) -> mrt.Result:
-    """Render a numbered scene by the report's lattice with its layers, or Mitsuba's Cornell box."""
-    runtime.use(variant)
+def scene_dict(name: str, size: dict[str, int]) -> dict[str, Any]:
+    """Return a numbered scene as a dict."""
+    return mrt.scene_dict(int(name), **size)
+
+
+def picture(name: str, variant: str, size: dict[str, int]) -> np.ndarray:
+    """Render a numbered scene by the report's lattice, or Mitsuba's Cornell box, [H, W, 3]."""
     options: dict[str, Any] = {**size, "aamode": "none", "variant": variant}
     if name == BOX:
-        return mrt.render(mi.cornell_box(), aa=1, spp=16, **options)
-    return mrt.render(int(name), aa=4, focaldist=0, layers=LAYERS, **options)
+        runtime.use(variant)
+        return mrt.render(mi.cornell_box(), aa=1, spp=16, **options).image
+    return mrt.render(int(name), aa=AA, focaldist=0, **options).image
 
 
 def relative(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return differences over 1 + the largest value of a pixel, [H, W]."""
-    one, other = (np.nan_to_num(np.atleast_3d(values), posinf=1e6) for values in (one, other))
     return np.abs(one - other).max(-1) / (1 + np.abs(other).max(-1))
 
 
-def first_layer(one: mrt.Result, other: mrt.Result, pixel: tuple[int, int]) -> str:
-    """Return the first layer that differs in a pixel, given as row and column, and its values."""
-    for name in sorted(one.layers, key=lambda name: LAYERS.index(name.partition(".")[0])):
-        values = one.layers[name], other.layers[name]
-        if relative(*values)[pixel] > ROUNDING:
-            return f"{name} is {values[0][pixel]} against {values[1][pixel]}"
-    return "no layer differs: look at how samples are summed"
+def camera_ray(scene: mi.Scene, x: float, y: float) -> dict[str, Any]:
+    """Return the ray through a place on the film, from 0 to 1."""
+    ray, _ = scene.sensors()[0].sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(x, y), mi.Point2f(0.5))
+    return {"origin": ray.o, "direction": ray.d}
+
+
+def at_ray(scene: mi.Scene, origin: Sequence[float], direction: Sequence[float]) -> dict[str, Any]:
+    """Return what a ray brings and, where it hits, what it meets and the mirror ray from there."""
+    ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 1)
+    hit = scene.ray_intersect(ray)
+    radiance = scene.integrator().sample(scene, sampler, mi.RayDifferential3f(ray))[0]
+    found = {"radiance": mi.unpolarized_spectrum(radiance)}
+    if not np.ravel(hit.is_valid())[0]:
+        return found
+    mirrored = hit.to_world(mi.reflect(hit.wi))
+    place = {"hit distance": hit.t, "geometric normal": hit.n, "shading normal": hit.sh_frame.n}
+    return {**place, "direction": mirrored, "origin": hit.spawn_ray(mirrored).o, **found}
+
+
+def first_difference(name: str, pixel: Sequence[int], variants: Sequence[str], size: dict[str, int]) -> str:
+    """Follow the samples of a pixel, given as row and column, to the first value that differs.
+
+    Each ray is that of the second variant, so that a difference is made where it is found.
+    """
+    scenes = {}
+    for variant in variants:
+        runtime.use(variant)
+        scenes[variant] = mi.load_dict(scene_dict(name, size))
+
+    def in_both(measure: Callable[..., dict[str, Any]], *arguments: Any) -> list[Values]:
+        sides = []
+        for variant, scene in scenes.items():
+            runtime.use(variant)
+            found = measure(scene, *arguments)
+            sides.append({key: np.array(value, np.float64).ravel() for key, value in found.items()})
+        return sides
+
+    row, column = pixel
+    for number in range(AA * AA):
+        down, right = divmod(number, AA)
+        x = (column + 0.5 + right / AA) / size["width"]
+        y = (row + 0.5 - down / AA) / size["height"]
+        way = f"sample {number}, from the camera"
+        one, other = in_both(camera_ray, x, y)
+        for bounce in range(BOUNCES):
+            if one.keys() != other.keys():
+                return f"{way}: a hit in one variant only"
+            for key, value in other.items():
+                if not relative(one[key], value) <= ROUNDING:
+                    return f"{way}: {key} {one[key]} against {value}"
+            if "origin" not in other:
+                break
+            ray = [other[key].tolist() for key in ("origin", "direction")]
+            way = f"sample {number}, bounce {bounce}, ray {ray[0]} → {ray[1]}"
+            one, other = in_both(at_ray, *ray)
+    return "no value of a single ray differs: look at how samples are summed, or at the rays' order"
 
 
 def compare_pictures(variants: Sequence[str], names: Sequence[str], deadline: float) -> Iterator[bool]:
@@ -65,9 +122,9 @@ def compare_pictures(variants: Sequence[str], names: Sequence[str], deadline: fl
             print(f"scene {name}: not compared, {SECONDS} s are over", flush=True)
             continue
         one, other = (picture(name, variant, size) for variant in variants)
-        off = relative(one.image, other.image)
+        off = relative(one, other)
         turned = float((off > ROUNDING).mean())
-        mean = float(np.abs(one.image - other.image).mean())
+        mean = float(np.abs(one - other).mean())
         agrees = mean <= MEAN and turned <= TURNED
         found = (
             f"mean difference {mean:.2e}, {turned:.2%} of pixels above {ROUNDING:g}, largest {off.max():.2e}"
@@ -75,34 +132,42 @@ def compare_pictures(variants: Sequence[str], names: Sequence[str], deadline: fl
         print(f"scene {name}: {found}: {'same' if agrees else 'DIFFERS'}", flush=True)
         if not agrees:
             row, column = divmod(int(off.argmax()), off.shape[1])
-            where = f"row {row}, column {column}: {one.image[row, column]} against {other.image[row, column]}"
-            print(f"  worst pixel: {where}; {first_layer(one, other, (row, column))}", flush=True)
+            print(
+                f"  worst pixel: row {row}, column {column}: {one[row, column]} against {other[row, column]}"
+            )
+            if name != BOX:
+                print(f"  {first_difference(name, (row, column), variants, size)}", flush=True)
         yield agrees
 
 
-def run_tests(device: str, files: Sequence[str], deadline: float) -> Iterator[bool]:
-    """Run files of device tests, each in its process; print a line and yield whether it passed."""
-    environment = os.environ | {"MRT_DEVICE": device}
+def run_tests(device: str, tests: Sequence[str], deadline: float) -> Iterator[bool]:
+    """Run files of device tests, each in its process, and those of a file that crashed one by one.
+
+    Print a line for each; yield whether it passed.
+    """
     marked = "device and not package and not slow"
-    for file in files:
+    command = [sys.executable, "-m", "pytest", "-q", "--no-header", "-m", marked]
+    run = partial(subprocess.run, env=os.environ | {"MRT_DEVICE": device}, capture_output=True, text=True)
+    for test in tests:
         left = deadline - time.monotonic()
         if left <= 0:
-            print(f"{file}: not run, {SECONDS} s are over", flush=True)
+            print(f"{test}: not run, {SECONDS} s are over", flush=True)
             continue
-        command = [sys.executable, "-m", "pytest", "-q", "--no-header", "-m", marked, file]
         try:
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=left)
+            done = run([*command, test], timeout=left)
         except subprocess.TimeoutExpired:
-            print(f"{file}: ended at the time limit", flush=True)
+            print(f"{test}: ended at the time limit", flush=True)
             yield False
             continue
         if done.returncode == 5:  # no device tests
             continue
+        crashed = done.returncode < 0
         ending = (done.stdout.strip().splitlines() or [""])[-1]
-        if done.returncode < 0:  # by a signal; pytest has written where
-            tests = re.findall(r"in (test_\w+)$", done.stderr, re.MULTILINE) or ["no test"]
-            ending = f"CRASHED with {signal.Signals(-done.returncode).name} in {tests[0]}"
-        print(f"{file}: {ending}", flush=True)
+        print(f"{test}: {f'CRASHED by signal {-done.returncode}' if crashed else ending}", flush=True)
+        if crashed and "::" not in test:
+            listed = run([*command, "--collect-only", test]).stdout.splitlines()
+            each = [f"{test}::{line.split('::', 1)[1]}" for line in listed if "::" in line]
+            yield from run_tests(device, each, deadline)
         yield done.returncode == 0
 
 

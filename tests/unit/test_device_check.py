@@ -15,20 +15,30 @@ needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, rea
 
 
 @needs_llvm
-def test_pictures_that_agree_hold_and_others_name_a_layer(monkeypatch, capsys):
-    """One variant is given another scene: its objects are at other distances."""
-    monkeypatch.setattr(device, "SMALL", {"width": 12, "height": 9})
+def test_pictures_that_agree_hold_and_others_are_followed_to_a_ray(monkeypatch, capsys):
+    """One variant is given a larger ball: its hits are nearer, from the same camera rays."""
+    size = {"width": 12, "height": 9}
+    monkeypatch.setattr(device, "SMALL", size)
+    monkeypatch.setattr(device, "AA", 1)
     assert list(device.compare_pictures(VARIANTS, ["0"], time.monotonic() + 200)) == [True]
     assert "scene 0: mean difference" in capsys.readouterr().out
-    picture = device.picture
-    monkeypatch.setattr(device, "picture", lambda name, variant, size: picture(name[variant], variant, size))
-    names = {"llvm_ad_rgb": "0", "scalar_rgb": "1"}
-    assert list(device.compare_pictures(VARIANTS, [names], time.monotonic() + 200)) == [False]
-    shown = capsys.readouterr().out
-    assert "DIFFERS" in shown and "worst pixel: row " in shown and "; depth.Z is " in shown
+    whole = device.scene_dict
+
+    def changed(name, size):
+        nodes = whole(name, size)
+        if device.mi.variant().startswith("scalar"):
+            sphere = next(n for n in nodes.values() if isinstance(n, dict) and n["type"] == "sphere")
+            sphere["radius"] = 1.1 * sphere.get("radius", 1.0)
+        return nodes
+
+    monkeypatch.setattr(device, "scene_dict", changed)
+    same, ball = (device.first_difference("0", pixel, VARIANTS, size) for pixel in ((2, 2), (5, 5)))
+    assert same.startswith("no value of a single ray differs")
+    assert ball.startswith("sample 0, bounce 0, ray") and ": hit distance [" in ball
 
 
 def test_a_crash_gets_the_name_of_its_test(tmp_path, capsys):
+    """A file whose process ends by a signal is run again test by test."""
     file = tmp_path / "test_dies.py"
     file.write_text(
         "import os, signal, pytest\n"
@@ -36,5 +46,8 @@ def test_a_crash_gets_the_name_of_its_test(tmp_path, capsys):
         "def test_lives(): pass\n"
         "def test_dies(): os.kill(os.getpid(), signal.SIGSEGV)\n"
     )
-    assert list(device.run_tests("llvm", [str(file)], time.monotonic() + 200)) == [False]
-    assert "test_dies.py: CRASHED with SIGSEGV in test_dies" in capsys.readouterr().out
+    results = list(device.run_tests("llvm", [str(file)], time.monotonic() + 200))
+    said = capsys.readouterr().out
+    assert results.count(False) == 2  # the file, and the test
+    assert "test_dies.py::test_dies: CRASHED by signal 11" in said
+    assert "test_lives: 1 passed" in said
