@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from itertools import product
 from typing import Any
 
 import mitsuba as mi
@@ -95,13 +94,6 @@ def test_every_pass_reports_its_progress_to_the_end():
         "Anti-aliasing": [refined, refined, "Computing Anti aliasing.."],
         "Depth of field": [1200, 1200, "Computing depth of field.."],
     }
-
-
-def test_plan_says_that_one_random_ray_takes_noise_for_edges():
-    scene = mrt.scene_dict(0, width=8, height=6)
-    for mode, integrator, spp in product(("sobel", "geometry"), ("path", None), (1, 2)):
-        plan = str(mrt.render(scene, aa=2, aamode=mode, integrator=integrator, spp=spp).plan)
-        assert ("noise will count as edges" in plan) == ((mode, integrator, spp) == ("sobel", "path", 1))
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian", "mitchell"])

@@ -14,7 +14,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import pytest
 from cases import but_slow
 from nodes import TRIANGLE, scene_xml
@@ -78,26 +77,6 @@ def test_no_native_code_from_the_folders_of_process_and_scene(run_python, mrt_co
     done = mrt_command(*words, MRT_TRAP=str(sign), code=1)
     assert "native code that is not Mitsuba's" in done.stderr
     assert not sign.exists()
-
-
-@pytest.mark.slow
-def test_hundreds_of_python_shapes_load(variant, tmp_path):
-    """Loaded in parallel, 300 of them overflowed the stack each time."""
-    count = 400 if ROUNDS == 1 else 10_000
-    cone = "<shape type='mrt_cone'><integer name='segments' value='3'/><point name='apex' value='{} 1 0'/>"
-    ends = "<point name='base_center' value='0 0 0'/></shape>"
-    cones = scene_xml("".join(cone.format(i) + ends for i in range(count)))
-    (tmp_path / "cones.xml").write_text(cones)
-    assert len(mi.load_file(str(tmp_path / "cones.xml")).shapes()) == count
-    assert len(mi.load_string(cones).shapes()) == count
-    each = {"type": "mrt_cone", "apex": [0, 1, 0], "base_center": [0, 0, 0], "segments": 3}
-    mi.load_dict({"type": "scene", "group": {"type": "shapegroup"} | {f"c{i}": each for i in range(count)}})
-    assert mrt.render(str(tmp_path / "cones.xml"), aa=1, integrator="mrt_whitted").image.shape == (3, 4, 3)
-    lines = ["mtllib m.mtl", "v 0 0 0", "v 1 0 0", "v 0 1 0"]
-    names = [f"m{i}" for i in range(count)]
-    (tmp_path / "m.mtl").write_text("".join(f"newmtl {n}\nKd 0.5 0.5 0.{n[1:]}\n" for n in names))
-    (tmp_path / "m.obj").write_text("\n".join(lines + [f"usemtl {n}\nf 1 2 3" for n in names]) + "\n")
-    assert mrt.render(str(tmp_path / "m.obj"), width=4, height=3, aa=1).image.shape == (3, 4, 3)
 
 
 READ_MODELS = """

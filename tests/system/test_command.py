@@ -15,7 +15,6 @@ from PIL import Image
 from mrt_mitsuba.files.images import read_exr
 
 MRT = Path(sys.executable).with_name("mrt")
-TINY = ("width=16", "height=12", "quiet=1", "format=exr")
 
 
 def test_picture_and_its_two_files_of_the_same_bytes_each_time(mrt_command, tmp_path):
@@ -58,52 +57,12 @@ def test_output_that_cannot_be_printed(run_command, tmp_path, words, code, error
         assert read_exr(tmp_path / "out.exr").image.shape == (6, 8, 3)
 
 
-def test_kernels_that_cannot_be_read_back_or_kept_are_made_anew(mrt_command, tmp_path):
-    """Where there is no place for them, Dr.Jit says so in one line."""
-    home = tmp_path / "home"
-    home.mkdir()
-    mrt_command("good", "0", *TINY, HOME=str(home), DRJIT_CACHE_DIR=None)
-    kernels = sorted((home / ".drjit").iterdir())
-    for k, kernel in enumerate(kernels):
-        kernel.write_bytes(b"rubbish" * 999 if k % 2 else kernel.read_bytes()[:10])
-    assert kernels
-    assert not mrt_command("after", "0", *TINY, HOME=str(home), DRJIT_CACHE_DIR=None).stderr
-    (tmp_path / "file").write_text("")
-    done = mrt_command("without", "0", *TINY, HOME=str(tmp_path / "file"), DRJIT_CACHE_DIR=None)
-    assert done.stderr.count("\n") <= 1
-    good, *others = (read_exr(tmp_path / f"{name}.exr").image for name in ("good", "after", "without"))
-    assert_array_equal(others, [good, good])
-
-
-def test_exported_scene_renders(mrt_command, tmp_path):
-    done = mrt_command("export", "0", "--xml", "zero.xml", "--stock", "width=20", "height=10")
-    assert (done.stdout, done.stderr) == ("Wrote zero.xml\n", "")
-    text = (tmp_path / "zero.xml").read_text()
-    assert "roughplastic" in text
-    assert "mrt_" not in text
-    mrt_command("out", "scene=zero.xml", "aa=1", "aamode=none", "format=exr")
-    image = read_exr(tmp_path / "out.exr").image
-    assert image.shape == (10, 20, 3)
-    assert_allclose(image[0, 0], (0.1, 0.3, 0.5), atol=1e-6)  # the sky of scene 0, in float32
-
-
 def test_doctor(mrt_command):
     said = mrt_command("doctor").stdout
     assert "self-test: scene 0 at 16x12 in llvm_ad_rgb: passed" in said
     assert "LLVM" in said
     assert "variants: scalar_rgb" in said
     assert "not installed" not in said
-
-
-def test_levels_log_more(mrt_command):
-    silent, info = (
-        mrt_command("a", "0", "width=16", "height=12", "quiet=1", f"log={level}").stderr.splitlines()
-        for level in ("warn", "info")
-    )
-    assert not silent
-    for what in ("scene 0 loaded in", "rendering: 192 pixels in", "kernels: compiled in", "wrote"):
-        assert sum(what in line for line in info) >= 1
-    assert sum("wrote" in line for line in info) == 2  # PNG and EXR
 
 
 def test_info_and_plugins_of_a_file(mrt_command, run_command, tmp_path):

@@ -97,17 +97,6 @@ def test_channels_of_one_name_are_refused(name, options):
         mrt.render(scene(integrator), **options)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb", "scalar_spectral"], indirect=True)
-@pytest.mark.parametrize("name", ["error", "samples", "d"])
-def test_mrt_adaptive_around_aov(variant, name):
-    """``error:position`` has an ``error.Y`` of its own; in scalar variants, any was a TypeError."""
-    inner = {"type": "aov", "aovs": f"{name}:position", "inner": {"type": "path"}}
-    inside = {"type": "mrt_adaptive", "target": 0.1, "max_spp": 16, "nested": inner}
-    picture = np.array(mi.render(scene(inside)))
-    assert picture.shape == (6, 8, 3 + 3 + (2 if name == "d" else 1))
-    assert picture[..., 3:6].max() == pytest.approx(1, abs=0.2)  # of a ball of radius one
-
-
 @pytest.mark.parametrize(
     "inner", [{}, {"x": {"type": "path"}}, {"x": {"type": "direct"}, "y": {"type": "path"}}]
 )
@@ -136,17 +125,6 @@ def test_integrators_without_to_string(door):
         "target": lambda: mrt.render(loaded, target="2%").image,
     }
     assert_allclose(doors[door](), 0.25, rtol=1e-5)
-
-
-def test_integrators_without_to_string_in_errors_and_studies():
-    """Each was nanobind's "lookup failed!"."""
-    loaded = scene(of_the_user("a"))
-    with pytest.raises(mrt.UsageError, match="only an XML file declares names"):
-        mrt.render(loaded, params={"width": 3})
-    with pytest.raises(mrt.UsageError, match="scene is Named: give a number"):
-        mrt.render(loaded.integrator())
-    found = mrt.error_vs_time(loaded, {"it": {"spp": 1}}, reference={"spp": 2}, repeats=2)
-    assert_allclose(found.points["it"].rmse, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("options", [{}, {"spp": 4}], ids=str)

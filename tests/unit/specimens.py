@@ -30,10 +30,6 @@ class Mistake:
 # --------------------- Changes of values and weights: of (value, ctx, wi, wo) ---------------------
 
 
-def without_cosine(value, ctx, wi, wo):
-    return value / abs(wo.z)
-
-
 def no_number_in_sharp_lobes(value, ctx, wi, wo):
     return dr.select(value > 1e5, dr.nan, value)
 
@@ -60,10 +56,6 @@ def by_an_index_that_is_no_number(value, ctx, wi, wo):
     """A table over the half vector, which there is none of where wo = -wi."""
     index = mi.Int32(dr.normalize(wi + wo).z) if is_jit() else 0
     return value * dr.gather(mi.Float, mi.Float(1, 1), index) if is_jit() else value
-
-
-def detached(value, ctx, wi, wo):
-    return dr.detach(value)
 
 
 SWITCHES = [0]  # of variants, so far
@@ -94,21 +86,8 @@ def member(name, change):
     return apply
 
 
-def too_long(wo):
-    return 1.01 * wo
-
-
 def turned(wo):
     return mi.Vector3f(0.8 * wo.x - 0.6 * wo.y, 0.6 * wo.x + 0.8 * wo.y, wo.z)
-
-
-def to_the_other_side(wo):
-    return wo * mi.Vector3f(1, 1, -1)
-
-
-def rarely_negative(bs, weight, u, ctx):
-    bs.pdf = dr.select((u.x > 0.6) & (u.x < 0.6 + 1e-5), -bs.pdf, bs.pdf)
-    return bs, weight
 
 
 def following(component):
@@ -116,14 +95,9 @@ def following(component):
 
 
 OF_VALUES = {
-    # then it is no reciprocal value, and what sample() and eval() disagree on shows in the energy as well
-    "missing cosine": Mistake(
-        "eval", without_cosine, {"weights.weight", "energy.apart", "reciprocity.swapped"}
-    ),
     "cancelling half vector": Mistake("value", cancelling, {"roundoff.lost"}, GLOSS),
     "NaN at the least roughness": Mistake("value", no_number_in_sharp_lobes, {"finite.values"}, GLOSS),
     "index that is no number": Mistake("value", by_an_index_that_is_no_number, {"finite.reads"}),
-    "detached gradient": Mistake("value", detached, {"gradients.values"}, GLOSS),
     "derivatives that are NaN": Mistake("value", steep, {"gradients.values", "gradients.broken"}, GLOSS),
     # whatever types of lobes are asked for
     "light through the surface": Mistake(
@@ -132,17 +106,7 @@ OF_VALUES = {
     "another value after each switch": Mistake("value", by_switches, {"switch.same"}),
 }
 OF_SAMPLES = {
-    "directions not of length 1": Mistake(
-        "sample", member("wo", too_long), {"finite.samples", "finite.million"}, MIRROR
-    ),
-    "density that is rarely negative": Mistake("sample", rarely_negative, {"finite.million"}),
     "mirror turned": Mistake("sample", member("wo", turned), {"reciprocity.returns"}, MIRROR),
-    "mirror to the other side": Mistake(
-        "sample",
-        member("wo", to_the_other_side),
-        {"reciprocity.single", "components.samples"},
-        MIRROR,
-    ),
     "next component": Mistake("sample", member("sampled_component", following), {"components.samples"}),
     # of directions that move with the roughness
     "derivative of the density in weights": Mistake(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import io
 import json
-import re
 import signal
 import sys
 import time
@@ -19,7 +17,6 @@ from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.command import options, registry
 from mrt_mitsuba.errors import MrtError, MrtWarning, SceneError
 from mrt_mitsuba.rendering import api
-from mrt_mitsuba.rendering.progress import TerminalProgress
 
 SMALL = ("width=16", "height=12")
 
@@ -165,23 +162,6 @@ def test_ctrl_c_leaves_the_old_file_and_does_not_wait_for_the_kernel(start, tmp_
     assert errors == "mrt: interrupted\n"
     assert [path.name for path in tmp_path.iterdir()] == ["out.png"]
     assert (tmp_path / "out.png").read_bytes() == b"old"
-
-
-def test_bar_on_a_terminal_shows_the_time_left(monkeypatch):
-    messages = io.StringIO()
-    bars = io.StringIO()
-    for stream in (messages, bars):
-        monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
-    with TerminalProgress(file=messages, bar_file=bars).stage("Rendering", 1000, "message") as advance:
-        for _ in range(4):
-            time.sleep(0.12)  # tqdm draws ten times a second at most
-            advance(200)
-    assert messages.getvalue() == "message\n"
-    text = bars.getvalue()
-    assert "Rendering:" in text
-    assert "80%" in text
-    assert re.search(r"<\d\d:\d\d", text)
-    assert text.endswith("\r")  # cleared at the end
 
 
 @pytest.mark.parametrize("name", registry.COMMANDS)

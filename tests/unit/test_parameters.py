@@ -36,17 +36,6 @@ def test_a_render_with_params_is_that_of_the_scene_changed_by_hand():
     assert abs(result.image - mrt.render(3, focaldist=0, **SIZE).image).max() > 0.1
 
 
-def test_params_reach_what_is_made_of_them():
-    """What a ball is traced by follows from its transform, once the update arrives."""
-    nodes = {"type": "scene", "sensor": sensor([0, 0, 5], [0, 0, 0], (16, 12)), "ball": {"type": "sphere"}}
-    aside = mi.ScalarTransform4f().translate([0.5, 0.25, 1])
-    moved = {**nodes, "ball": {"type": "sphere", "to_world": aside}}
-    options = {"integrator": "mrt_whitted", "aa": 1, "lattice": "report", "layers": ["depth"]}
-    depth = mrt.render(nodes, params={"ball.to_world": mi.Transform4f(aside)}, **options).layers["depth.Z"]
-    assert_array_equal(depth, mrt.render(moved, **options).layers["depth.Z"])
-    assert np.isfinite(depth).any()
-
-
 IDENTITY = [[float(row == column) for column in range(4)] for row in range(4)]
 saved = Cases()
 saved("material_0.alpha", lambda: np.float32(0.5), 0.5)

@@ -19,13 +19,6 @@ from mrt_mitsuba.scene.report import report_scene
 SIZE = {"width": 96, "height": 72, "aa": 1}
 
 
-@pytest.mark.parametrize("number", range(10))
-def test_watertight_triangles_are_asked_for_where_there_are_any(number):
-    """The report's own scenes have none, and their pictures must not change by a bit."""
-    flag = mrt.scene_dict(number).get("embree_use_robust_intersections", False)
-    assert flag is (number in (5, 6, 7, 8))
-
-
 @pytest.mark.parametrize(("number", "triangles"), [(5, 1588), (6, 646), (7, 7620), (8, 12)])
 def test_scenes_of_models_render_and_repeat(number, triangles):
     """Mitsuba leaves merged meshes in another order every time, and with it their numbers in layers; these

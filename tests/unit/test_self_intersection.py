@@ -86,24 +86,3 @@ def test_a_mesh_in_a_group_is_refused_once_it_has_grown(variant):
     parameters.update()
     with pytest.raises(SceneError, match=r"the mesh .* is .* across .*: scale the scene"):
         render(scene, aa=1)
-
-
-@pytest.mark.parametrize("size", [1e-7, 1e9])
-def test_meshes_are_drawn_at_every_size_that_is_taken(variant, size):
-    """The picture is that at size 1, with triangles in all directions."""
-    rng = np.random.default_rng(1)
-    corners = rng.normal(size=(60, 3))
-    faces = rng.permuted(np.tile(np.arange(60), (40, 1)), axis=1)[:, :3]
-
-    def picture(s: float) -> np.ndarray:
-        clips = {"near_clip": 0.01 * s, "far_clip": 1e4 * s}
-        scene = {"type": "scene", "integrator": WHITTED, "embree_use_robust_intersections": True}
-        scene["sensor"] = sensor([0, 0, 6 * s], [0, 0, 0], (48, 36), fov=30, **clips)
-        scene["light"] = {"type": "mrt_light", "position": [2 * s, 3 * s, 5 * s]}
-        scene["mesh"] = mesh(corners * s, faces) | {"bsdf": {"type": "mrt_bsdf"}}
-        return render(scene, aa=1).image
-
-    unit = picture(1.0)
-    assert unit.std() > 0.01
-    off = np.abs(picture(size) - unit) > 1e-3
-    assert off.any(axis=-1).mean() < 2e-3

@@ -57,7 +57,7 @@ def test_look_up_is_the_report_s(picture, variant):
         assert_allclose(got, expected(values, u, v), atol=1e-7)
 
 
-@pytest.mark.parametrize("mode", ["P", "LA"])
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGBA"])
 def test_other_kinds_of_pictures(tmp_path, mode):
     values = np.tile(np.array([[0, 80], [160, 240]], np.uint8)[:, :, None], (1, 1, 3))
     image = Image.fromarray(values).convert(mode)
