@@ -191,7 +191,6 @@ def test_rays_go_where_the_noise_is():
     scene = load_kind("texture", WIDTH, "independent", height=HEIGHT)
     truth = np.array(mi.render(scene, spp=2**14, seed=5))
     result = mrt.render(scene, aamode="noise", spp=64, seed=3)
-    assert result.rounds[-1].spp == pytest.approx(64, rel=0.1)
     assert result.rays["primary"] == pytest.approx(64 * WIDTH * HEIGHT, rel=0.1)
     uniform = _rmse(np.array(mi.render(scene, spp=64, seed=3)), truth)
     assert _rmse(result.image, truth) < 0.6 * uniform

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import sys
@@ -16,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mrt_mitsuba as mrt
 from mrt_mitsuba.validation import cli
 from mrt_mitsuba.validation.study import Study
 
@@ -57,8 +55,9 @@ def good(study: Study, *, quick: bool) -> None:
     study.at_least("power", 0.9, 0.5, "a reason")
     study.goal("ratio of seconds", 1.4, 1.3, "taken in turn", interval=(1.35, 1.5))
     study.goal("another ratio", 1.2, 1.3, "taken in turn", interval=(1.1, 1.5))
-    rows = [["Ag", 0.123456789, 2], ["Au", np.float32(2e-5), quick], ["Cu", INFINITE, 12345678]]
-    study.records("errors", "Errors", [dict(zip(("metal", "error", "n"), row, strict=True)) for row in rows])
+    rows = [{"metal": "Ag", "error": 0.123456789, "n": 2}]
+    rows += [{"metal": "Cu", "error": np.float32("inf"), "n": 12345678}]
+    study.records("errors", "Errors", rows)
     study.records("answer", "What to do", [{"setting": "aa=2"}], first=True)
     study.picture("curve", "A curve", figure, "rises")
     study.picture("ball", "A ball", np.full((4, 5, 3), 0.25))
@@ -82,25 +81,19 @@ def test_everything_a_study_finds_is_written(validate, tmp_path, capsys):
     assert (found["title"], found["verdict"]) == (TITLE, "passed")
     bound = {"name": "largest error", "measured": 1e-6, "limit": 1e-5, "sense": "<=", "holds": True}
     assert found["bounds"][0] == {**bound, "verdict": "ok", "note": "a reason"}
-    with open(tmp_path / "good-errors.csv", newline="") as file:
-        assert list(csv.reader(file))[:2] == [["metal", "error", "n"], ["Ag", "0.123456789", "2"]]
-    table = found["tables"]["errors"]
-    assert (table["columns"], table["rows"][0]) == (["metal", "error", "n"], ["Ag", 0.123456789, 2])
-    assert table["rows"][2] == ["Cu", "Infinity", 12345678]
+    rows = [["Ag", 0.123456789, 2], ["Cu", "Infinity", 12345678]]
+    assert found["tables"]["errors"]["rows"] == rows
+    assert (tmp_path / "good-errors.csv").read_text().startswith("metal,error,n\nAg,0.123456789,2\n")
     # goals are not reached, and yet the study has passed; one is within the interval
     assert [goal["verdict"] for goal in found["goals"]] == ["slower", "open"]
-    shown = capsys.readouterr().out
-    assert "ok     largest error: 1e-06 <= 1e-05" in shown
-    assert "slower ratio of seconds" in shown
+    assert "ok     largest error: 1e-06 <= 1e-05" in capsys.readouterr().out
     # The page holds all of it and loads nothing; answers come first, tables last, and texts are texts
     links = re.findall(r'(?:src|href)="(.*?)"', page)
     assert all(link.startswith(("#", "data:image/png;base64,")) for link in links)
     assert len(re.findall("<img", page)) == 2
-    assert "<script" not in page
-    assert "<b>" not in page
+    assert not re.search("<script|<b>", page)
     assert page.index("What to do") < page.index("A curve") < page.index("Errors")
-    texts = [TITLE, "in a <b>sentence</b>.", "0.1235", "2e-05", "12345678", "yes", "inf", "1e-06", "a reason"]
-    texts += ["✓ holds", "slower", "not decided", "cores", "quick settings", "<em>The original</em>"]
+    texts = [TITLE, "in a <b>sentence</b>.", "0.1235", "inf", "1e-06", "a reason", "slower", "not decided"]
     assert [text for text in texts if text not in unescape(page)] == []
 
 
@@ -127,12 +120,10 @@ def test_what_does_not_pass_is_shown_and_the_others_go_on(validate, capsys, bad,
 
 
 def test_list_has_a_line_on_each_study_and_each_can_be_run(capsys, monkeypatch, tmp_path):
-    for option in ("--list", "--help"):
-        with pytest.raises(SystemExit) as ended:
-            cli.main([option])
-        text = capsys.readouterr().out
-        assert ended.value.code == 0
-        assert all(about and about in text for _, about, *_ in cli.STUDIES.values())
+    with pytest.raises(SystemExit):
+        cli.main(["--list"])
+    text = capsys.readouterr().out
+    assert all(about and about in text for _, about, *_ in cli.STUDIES.values())
     for name, _, quick, full in cli.STUDIES.values():
         module = import_module(f"mrt_mitsuba.validation.studies.{name}")
         assert module.TITLE
@@ -166,24 +157,6 @@ def test_what_is_missing_is_found_before_the_work(monkeypatch, tmp_path, capsys)
     assert not (tmp_path / "report").exists()
 
 
-def test_each_result_is_printed_as_its_study_ends(validate, capsys):
-    def later(study: Study, *, quick: bool) -> None:
-        out, errors = capsys.readouterr()
-        assert f"good: {TITLE} - PASSED" in out
-        assert "This takes about 4 s" in errors
-        assert "about 2 s to go" in errors
-        study.at_most("shown", 0, 0, "a reason")
-
-    assert validate(good=good, later=later)[0] == 0
-
-
-def test_version(capsys):
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["--version"])
-    assert ended.value.code == 0
-    assert capsys.readouterr().out == f"mrt-validate {mrt.__version__}\n"
-
-
 def test_interrupt_leaves_the_report_as_it_was(validate, tmp_path):
     def interrupted(study: Study, *, quick: bool) -> None:
         raise KeyboardInterrupt
@@ -192,15 +165,3 @@ def test_interrupt_leaves_the_report_as_it_was(validate, tmp_path):
     assert validate(good=good, slow=interrupted)[0] == cli.INTERRUPTED
     assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
     assert (tmp_path / "summary.json").read_text() == "before"
-
-
-@pytest.mark.parametrize("wrong", [False, True])
-def test_long_lists_are_folded_unless_a_bound_is_missed(validate, wrong):
-    def many(study: Study, *, quick: bool) -> None:
-        study.records("long", "Long", [{"i": i} for i in range(40)])
-        for i in range(40):
-            study.at_most(f"bound {i}", float(wrong and i == 3), 0, "a reason")
-
-    page = validate(many=many)[2]
-    assert page.count("<details>") == (1 if wrong else 2)
-    assert page.count("✗ missed") == (3 if wrong else 0)  # in the list, the title and the row

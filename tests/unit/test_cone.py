@@ -57,22 +57,20 @@ def test_positions_differentiate_with_the_parameters(name):
     """Derivatives of all vertices by automatic differentiation against finite differences."""
     ends = [key for key in SHAPES[name] if key not in ("type", "radius")]
     weights = mi.Float(np.random.default_rng(4).normal(size=3 * shape(name, segments=8).vertex_count()))
-    steps = [(ends[0], (1, 0, 0)), (ends[0], (0, 1, 0)), (ends[1], (0, 0, 1)), ("radius", 1)]
 
-    def weighted_sum(key: str, step: Any, by: Any) -> Any:
+    def weighted_sum(key: str, by: Any) -> Any:
         mesh = shape(name, segments=8)
         parameters = mi.traverse(mesh)
-        value = parameters[key]
-        parameters[key] = value + by if key == "radius" else mi.Point3f(value + mi.Vector3f(step) * by)
+        parameters[key] = parameters[key] + by  # of a point, along (1, 1, 1)
         parameters.update()
         return dr.sum(mi.traverse(mesh)["vertex_positions"] * weights)
 
-    for key, step in steps:
+    for key in (*ends, "radius"):
         by = mi.Float(0)
         dr.enable_grad(by)
-        dr.backward(weighted_sum(key, step, by))
+        dr.backward(weighted_sum(key, by))
         # a step of 1e-2 leaves a truncation of 1e-4, and a rounding of 1e-7 / 1e-2
-        above, below = (weighted_sum(key, step, sign * 1e-2)[0] for sign in (1, -1))
+        above, below = (weighted_sum(key, sign * 1e-2)[0] for sign in (1, -1))
         assert dr.grad(by)[0] == pytest.approx((above - below) / 2e-2, rel=2e-2, abs=2e-2)
 
 
