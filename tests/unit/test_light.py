@@ -150,20 +150,6 @@ def test_lights_of_the_table_are_those_of_calls(row):
         assert_allclose(image, np.array(mi.render(scene, spp=1)), atol=1e-6)
 
 
-@in_variants
-@pytest.mark.usefixtures("other_lights")
-def test_parameters_of_other_lights_are_checked_and_can_be_updated(variant):
-    with pytest.raises(Exception, match=r"edge.* is 2\.0, but must be a finite number >= 0 and <= 0\.99"):
-        light(type="leaning", edge=2.0)
-    it = light(type="leaning", position=[0, 0, 2])
-    parameters = mi.traverse(it)
-    parameters["axis"] = [0, 2, -2]
-    parameters["edge"] = 0.25
-    parameters.update()
-    _, weight = it.sample_direction(point_at((0, 0, 0)), mi.Point2f(0.5))
-    assert_allclose(spectrum(weight), stock_spectrum(1.0) * (0.5**0.5 - 0.25) / 0.75, rtol=1e-6)
-
-
 def upright(kind: str) -> Callable[[float], dict[str, Any]]:
     ends = ("apex", "base_center") if kind == "cone" else ("p0", "p1")
     return lambda s: {"type": f"mrt_{kind}", ends[0]: [0, s, 0], ends[1]: [0, 0, 0], "radius": s}

@@ -12,13 +12,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cases import Cases
-from nodes import group
+from nodes import group, sensor
 
 from mrt_mitsuba.plugins import intersect
 from mrt_mitsuba.plugins.intersect import BASE, LATERAL, TOP
 from mrt_mitsuba.plugins.quadric_kinds import CLOSED, KINDS
 from mrt_mitsuba.plugins.whitted.quadrics import Quadrics
-from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Scene
+from mrt_mitsuba.scene.model import Cone, Cylinder, Material
 from mrt_mitsuba.validation.oracles import reference
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -184,11 +184,11 @@ def test_search_against_float64(kind, count, scale, place):
 
 def test_kernel_does_not_grow_with_the_number_of_cones():
     def operations(count: int) -> int:
-        cones = tuple(Cone((i, 1, 0), (i, 0, 0), 0.4, MATTE) for i in range(count))
-        view = Camera((5, 5, 5), (0, 0, 0))
-        above = Light((0, 10, 0), (1, 1, 1))
-        scene = Scene(view, (0, 0, 0), (above,), cones=cones)
-        loaded = mi.load_dict(scene.to_dict(width=8, height=8))
+        crowd = group([[i, 1, 0, i, 0, 0, 0.4] for i in range(count)], kind="cone")
+        nodes = {"type": "scene", "integrator": {"type": "mrt_whitted"}, "crowd": crowd}
+        nodes["light"] = {"type": "mrt_light", "position": [0, 10, 0]}
+        nodes["sensor"] = sensor([5, 5, 5], [0, 0, 0], (8, 8))
+        loaded = mi.load_dict(nodes)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             dr.eval(mi.render(loaded, spp=1))

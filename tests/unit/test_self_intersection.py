@@ -44,12 +44,11 @@ def floor(kind: str, half: float, turn: mi.ScalarTransform4f) -> dict[str, Any]:
 def test_a_grain_on_a_wide_floor_has_its_shadow(variant, kind, place, half):
     """A ball of radius 0.005, as ``direct`` draws it."""
     turn = mi.ScalarTransform4f().translate(list(place)).rotate([1, 0, 0], -90)
-    eye = np.add(place, [0.05, 0.06, 0.05]).tolist()
-    goal = np.add(place, [0, 0.005, 0]).tolist()
-    grain = {"type": "sphere", "center": [place[0], place[1] + 0.005, place[2]], "radius": 0.005}
-    lamp = [place[0] + 0.3, place[1] + 0.5, place[2] - 0.2]
-    nodes = {"type": "scene", "integrator": WHITTED, "floor": floor(kind, half, turn), "grain": grain}
-    nodes["sensor"] = sensor(eye, goal, (160, 120), fov=25, near_clip=1e-3)
+    steps = [[0.05, 0.06, 0.05], [0, 0.005, 0], [0.3, 0.5, -0.2]]
+    eye, center, lamp = np.add(place, steps).tolist()
+    nodes = {"type": "scene", "integrator": WHITTED, "floor": floor(kind, half, turn)}
+    nodes["grain"] = {"type": "sphere", "center": center, "radius": 0.005}
+    nodes["sensor"] = sensor(eye, center, (160, 120), fov=25, near_clip=1e-3)
     nodes["light"] = {"type": "point", "position": lamp}
     scene = mi.load_dict(nodes)
 
