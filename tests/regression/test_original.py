@@ -13,7 +13,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.filters import luma_edges, sobel_edges
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.oracles.reference import reference_render
-from mrt_mitsuba.validation.originals import Original, read_original
+from mrt_mitsuba.validation.originals import read_original
 
 # Mean absolute difference, and share of pixels off by more than 1/255, without detector or blur. Ours are off
 # at the borders of shadows, where the original's rays start a fixed distance off the surface and speckle
@@ -96,12 +96,3 @@ def test_the_same_pixels_are_refined(scene: int, detector: str, originals: Path)
     np.testing.assert_array_equal(adaptive, np.where(mask[..., None], full, plain.image))
     telling = (plain.image != full).any(axis=-1)
     assert telling.mean() > 0.99 and mask[telling].any() and not mask[telling].all()
-
-
-def test_a_picture_is_shortened_as_the_original_was(originals: Path) -> None:
-    """A whole picture stays as it is; means are those of blocks, and rounding is the last thing."""
-    original: Original = read_original(originals / "s3_none_aa4.exr")
-    ramp = np.arange(240 * 320 * 3, dtype=np.float32).reshape(240, 320, 3) / 1024
-    like = original.like(ramp)
-    assert like.shape == original.image.shape
-    assert like[0, 0, 0] == (ramp[0, 0, 0] if original.block == 1 else ramp[:2, :2, 0].mean())

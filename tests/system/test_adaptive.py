@@ -96,8 +96,10 @@ def test_every_pass_reports_its_progress_to_the_end():
     }
 
 
-@pytest.mark.parametrize("rfilter", ["box", "gaussian", "mitchell"])
-def test_the_noise_that_a_filter_averages_hides_fewer_edges(rfilter):
+@pytest.mark.parametrize(
+    ("rfilter", "lattice"), [("box", "report"), ("box", "film"), ("gaussian", "film"), ("mitchell", "film")]
+)
+def test_the_noise_that_a_filter_averages_hides_fewer_edges(rfilter, lattice):
     """A bright half behind a veil that stops every other ray; its edge is as strong as the pixels' own
     variance lets it be, which other seeds show."""
     black = {"type": "diffuse", "reflectance": 0.0}
@@ -108,7 +110,7 @@ def test_the_noise_that_a_filter_averages_hides_fewer_edges(rfilter):
     aside = mi.ScalarTransform4f().translate([10, 0, -9]).scale(10)
     nodes["half"] = {"type": "rectangle", "to_world": aside, "emitter": {"type": "area", "radiance": 1.0}}
     scene = mi.load_dict(nodes)
-    options = {"aa": 1, "aamode": "sobel", "spp": 64}
+    options = {"aa": 1, "aamode": "sobel", "spp": 64, "lattice": lattice}
     results = [mrt.render(scene, seed=seed, layers=["edges"], **options) for seed in range(24)]
     variance = np.var([result.image for result in results], axis=0, ddof=1)
     expected = [mrt.filters.sobel_edges(result.image, variance=variance).value for result in results]

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import mitsuba as mi
 import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba import runtime
 
 SIZE = {"width": 16, "height": 12}
 # Float32 in another order of operations; at edges and in narrow highlights a rounding can turn a pixel
@@ -66,16 +62,3 @@ def test_filters_and_updates_on_a_device(variant):
     after = mrt.render(scene, aa=2, lattice="report", focaldist=2.0).image
     assert np.isfinite(after).all()
     assert not np.array_equal(after, before[0])
-
-
-@pytest.mark.slow
-def test_device_tests_are_selected_where_they_are_asked_for(run_command):
-    """And ends with an error where the device is not there."""
-    tests = (Path(__file__), Path(__file__).parents[1] / "unit" / "test_parameters.py")
-    words = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "device", "--co", *tests)
-    found = run_command(*words, MRT_DEVICE="llvm").stdout
-    assert "test_light_buffers_follow_the_light" in found
-    assert "test_device_tests_are_selected" not in found  # no picture, no device
-    if "cuda_ad_rgb" not in mi.variants() or runtime.obstacle("cuda_ad_rgb"):
-        missing = run_command(*words, MRT_DEVICE="cuda", code=1)
-        assert "needs an NVIDIA GPU" in missing.stdout + missing.stderr

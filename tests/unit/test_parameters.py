@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import mitsuba as mi
@@ -14,7 +13,6 @@ from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.files.images import read_exr
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -34,21 +32,6 @@ def test_a_render_with_params_is_that_of_the_scene_changed_by_hand():
     assert_array_equal(result.image, mrt.render(scene, aa=1, lattice="report").image)
     assert result.options["params"] == values
     assert abs(result.image - mrt.render(3, focaldist=0, **SIZE).image).max() > 0.1
-
-
-IDENTITY = [[float(row == column) for column in range(4)] for row in range(4)]
-saved = Cases()
-saved("material_0.alpha", lambda: np.float32(0.5), 0.5)
-saved("material_0.alpha", lambda: mi.Float(0.5), 0.5)
-saved("light_1.intensity.value", lambda: np.array([0.5, 0.25, 1.0]), [0.5, 0.25, 1])
-saved("light_1.intensity.value", lambda: mi.Color3f(0.5, 0.25, 1), [0.5, 0.25, 1])
-saved("sphere_0.to_world", lambda: mi.ScalarTransform4f(), IDENTITY)
-
-
-@pytest.mark.parametrize(("key", "value", "written"), saved)
-def test_the_header_holds_values_of_any_type(tmp_path, key, value, written):
-    mrt.render(3, params={key: value()}, **SIZE).save(tmp_path / "a.exr")
-    assert json.loads(read_exr(tmp_path / "a.exr").header["mrt:options"])["params"] == {key: written}
 
 
 refused = Cases()
