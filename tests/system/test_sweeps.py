@@ -145,10 +145,9 @@ def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(address
     second = run()
     made_again = {name for name in first if first[name] != second[name]}
     assert made_again == {"seed=1.exr", "seed=1.png"}
-    third = run(fresnel="dielectric")
-    assert not set(second.values()) & set(third.values())
-    fourth = run(fresnel="dielectric", resume=False)
-    assert not set(third.values()) & set(fourth.values())
+    for other in ({"fresnel": "dielectric"}, {"aa": 2}, {"aa": 2, "resume": False}):
+        before = made(tmp_path)
+        assert not set(before.values()) & set(run(**other).values())
 
 
 def test_pictures_of_another_version_are_made_again(address, tmp_path, monkeypatch):

@@ -211,6 +211,7 @@ def test_colours_and_numbers_from_textures():
         "specular_reflectance": (KS, KD),
     }
     textured = bsdf(**{name: pair(*values) for name, values in numbers.items()})
+    assert mi.has_flag(bsdf(alpha=pair(*numbers["alpha"])).flags(1), mi.BSDFFlags.SpatiallyVarying)
     wi, wo = lobe_pairs(100, 0.3)
     for i, u in enumerate((0.25, 0.75)):
         si = interaction(wi, np.broadcast_to([u, 0.5], (100, 2)))

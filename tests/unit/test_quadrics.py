@@ -100,6 +100,14 @@ def test_surface_points_have_their_normal_and_uv(kind):
         assert dr.all((v >= 0) & (v <= 1))
 
 
+@pytest.mark.parametrize("kind", CLOSED)
+def test_stand_ins_are_wound_as_their_normals_point(kind):
+    vertices, faces = KINDS[kind].mesh(12)
+    corners = vertices[faces]
+    a, b, c = np.moveaxis(corners[..., :3], 1, 0)
+    assert (np.cross(b - a, c - a)[:, None] @ corners[..., 3:6].sum(axis=1)[:, :, None] > 0).all()
+
+
 def nearest(kind: str, ends: np.ndarray, radii: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Distances [N] by the float64 tracer, in lengths of d."""
     make = Cone if kind == "cone" else Cylinder
