@@ -15,13 +15,13 @@ from mrt_mitsuba.adaptive.estimate import SampleStatistics
 from mrt_mitsuba.filters.denoise import Denoised, denoise
 
 DENOISING_SPP = 12  # cost of denoising the two halves, in samples per pixel
-EXPECTED_RATIO = 0.45  # of the mixture's error to the plain one, before it is measured
+EXPECTED_RATIO = 0.4  # of the mixture's error to the plain one, before it is measured
 ERROR_DECAY = 0.75  # power of the plain error with which the error of the mixture falls
 CLOSE_ERROR = 1.1  # times the target: predicted error from which it is measured
-
+AIM = 0.93  # fraction of the target that a further measurement should find
 CAUTION = (
-    1 / 3
-)  # of the way from a squared error to the upper end of its interval, where it must be at a target
+    0.33  # part of the way from a squared error to the upper end of its interval that counts at a target
+)
 
 Features = tuple[np.ndarray, np.ndarray]  #: albedo and shading normals of first hits, [H, W, 3] each
 
@@ -57,8 +57,18 @@ class Denoiser:
             halves[0], halves[1], albedo, normal, encode=stats.metric.encode, unfiltered=unfiltered
         )
         plain = stats.image()[..., :3].astype(np.float32)
+        more = math.sqrt(stats.curvature(stats.metric))
+        found = replace(
+            found,
+            noisy=plain,
+            image=np.where(unknown, plain, found.image),
+            error=found.error * np.float32(more),
+            rmse=found.rmse * more,
+            low=found.low * more,
+            high=found.high * more,
+        )
         self._measured = (plain_error, cautious_error(found))
-        return replace(found, noisy=plain, image=np.where(unknown, plain, found.image))
+        return found
 
     def pays(self, spp: float, plain_error: float, target: float) -> bool:
         """True if the error of the mixture should be measured now, after ``spp`` samples per pixel."""
@@ -83,7 +93,7 @@ class Denoiser:
             return target
         if self._measured is None:
             return target / EXPECTED_RATIO
-        wanted = plain_error * (target / self._predicted(plain_error)) ** (1 / ERROR_DECAY)
+        wanted = plain_error * (AIM * target / self._predicted(plain_error)) ** (1 / ERROR_DECAY)
         samples = spp * (plain_error / wanted) ** 2 + DENOISING_SPP
         if samples >= spp * (plain_error / target) ** 2:
             self.left_out = f"the mixture needs {samples:.0f} samples per pixel, as many as without it"

@@ -115,7 +115,8 @@ class SampleStatistics:
         sums = Sums(count, self.sum[:, PILOTS].sum(1), self.sum_sq[PILOTS].sum(0))
         weights: np.ndarray = np.ones(self.film.shape, np.float32)
         if self.metric is not LINEAR:
-            deviation = np.sqrt(window_means(sums.variance, 1) / count)
+            # chords over two standard errors of a half, as far as its values may be from the clipped range
+            deviation = 2 * np.sqrt(window_means(sums.variance, 1) / self.count[0])
             slopes = self.metric.weights(sums.mean, deviation)
             energy = np.square(sums.mean) + np.float32(1e-30)  # noise of a channel is about as large as it
             weights = (slopes * energy).sum(0) / energy.sum(0)
@@ -166,8 +167,30 @@ class SampleStatistics:
 
         They are 0 where the picture is invalid.
         """
-        squares = metric.squared_errors(*self.half_pictures(blurred))
+        squares = metric.squared_errors(*self.half_pictures(blurred)) * self.curvature(metric)
         return np.where(self.unknown(REACH if blurred else 0)[..., None], 0, squares)
+
+    def curvature(self, metric: Metric) -> float:
+        """Factor to squared errors from the difference of the halves, for the curvature of the metric.
+
+        The difference of two noisy halves is encoded less steeply than that of their mean to the dark truth.
+        Of pilots, which are noisier, the factor is known, as their mean differs from that of the halves by
+        its true error; it falls about as the root of the rays grows.
+        """
+        if metric is LINEAR:
+            return 1.0
+        if self.pilots is None:
+            pilots = np.moveaxis(self.sum[:, PILOTS] / self.count[PILOTS], 0, -1)
+        else:
+            pilots = self.pilots.pictures()
+        valid = ~self.unknown(0)
+        first, second = (self.film.picture(picture)[valid] for picture in pilots)
+        halves = [half[valid] for half in self.half_pictures()]
+        found = 4 * metric.squared_errors((first + second) / 2, (halves[0] + halves[1]) / 2).mean()
+        found -= metric.squared_errors(*halves).mean()
+        expected = metric.squared_errors(first, second).mean()
+        growth = self.count[PILOTS].sum() / self.count[HALVES].sum()
+        return 1 + float(np.clip(found / max(expected, 1e-300) - 1, 0, 1)) * math.sqrt(growth)
 
     def luminance(self) -> float:
         """Mean luminance of the picture in the pilot buffers, which no averaged value decides."""
@@ -312,7 +335,7 @@ def ray_variance(
     mixed = np.tensordot(weights.astype(np.float32), more, 1)
     quiet, also = window_means(np.stack([seen, measured]), 1) == 0
     if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
-        mixed[quiet & also] = 0
+        mixed[quiet & also & ~_edges((first + second).mean.mean(0))] = 0
     mixed[..., stats.scale == 0] = 0
     every = differences(first, second)
     found, expected = window_means(every, WINDOWS[-1]) + 0.2 * every.mean((-2, -1), keepdims=True)
@@ -335,6 +358,15 @@ def _between_pixels(stats: SampleStatistics) -> float:
     seen = np.where(stats.invalid_dilated, 0, squares).mean()
     added = seen / film.filter_variance_ratio - film.between_pixel_share * found
     return float(np.clip(added / max(expected, 1e-300), 0, 1 - film.between_pixel_share))
+
+
+def _edges(means: np.ndarray) -> np.ndarray:
+    """Return where means [H, W] differ from a neighbour's: few rays may all have missed what lies between."""
+    differ = np.zeros(means.shape, bool)
+    limit = np.float32(1e-5) * np.abs(means)  # rounding of sums
+    differ[:, 1:] = np.abs(np.diff(means, axis=1)) > limit[:, 1:]
+    differ[1:] |= np.abs(np.diff(means, axis=0)) > limit[1:]
+    return dilated(differ, 1)
 
 
 def _around(film: Film, values: np.ndarray) -> np.ndarray:

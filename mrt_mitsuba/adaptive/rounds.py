@@ -40,11 +40,8 @@ GROWTH = 4.25  # maximum growth of the ray count per round: the error is known b
 MIN_GROWTH = 1.05  # minimum growth for which another round pays off
 MIN_RAYS = 2**17  # of a picture with a target: fewer do not show what is rare
 MIN_RELATIVE_DEVIATION = 0.25  # fraction of the mean deviation that each pixel has, until there are MIN_RAYS
-MIN_SPP = 256  # rays of a pixel that a target takes at least, in a picture so small that this is less
 TARGET_MARGIN = 0.97  # fraction of the target aimed for: a forecast is as often too low as too high
-MIN_MARGIN = 0.7  # whatever the standard error of the RMSE
-TRUSTED_GROWTH = 1.2  # of the ray count, for which a forecast is right without the gain of a sequence
-SAFETY = 1.5  # standard errors of the RMSE by which to aim lower, so that few pictures need a further round
+SAFETY = 1.5  # standard errors of the RMSE below the target, so that few pictures exceed it
 
 OnRound = Callable[[RoundPicture], object]
 Stage = Callable[[str, int, str], AbstractContextManager[Advance]]
@@ -191,16 +188,18 @@ def plan_round(
     seen = forecast(stats)
     if target is None:
         return allocator.allocate(stats, seen, most)
-    minimum = min(MIN_SPP, MIN_RAYS / stats.film.pixels, goal.max_spp)
+    minimum = min(MIN_RAYS / stats.film.pixels, goal.max_spp)
     if now.spp < 0.9 * minimum:  # allocations are rounded
         return allocator.allocate(stats, seen, min(most, minimum), MIN_RELATIVE_DEVIATION)
-    margin = max(TARGET_MARGIN - SAFETY * seen.uncertainty, MIN_MARGIN)
-    required = allocator.required_spp(stats, seen, margin * max(target, 1e-100))
-    if required < MIN_GROWTH * now.spp:
-        return _top_up(allocator, stats, seen, most, target, now)
-    if required > TRUSTED_GROWTH * now.spp:  # variance may fall as fast as spp^−(1 + gain)
-        required = now.spp * (required / now.spp) ** (1 / (1 + allocator.gain))
-    return _some(allocator, stats, seen, min(most, required), most)
+    caution = 1 + SAFETY * seen.uncertainty
+    if caution * now.rmse <= target:
+        return None
+    wanted = TARGET_MARGIN * target / (caution * now.rmse)
+    # of the ray count, in all pixels alike and in shares; these promise too much, as they follow the pilots' noise
+    alike = wanted**-2
+    in_shares = allocator.required_spp(stats, seen, max(wanted * seen.rmse, 1e-100)) / now.spp
+    growth = math.sqrt(alike * in_shares) ** (1 / (1 + allocator.gain))
+    return _some(allocator, stats, seen, min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1)), most)
 
 
 def _some(
@@ -212,16 +211,6 @@ def _some(
         spp = min(1.2 * spp, most)
         allocation = allocator.allocate(stats, seen, spp)
     return allocation
-
-
-def _top_up(
-    allocator: Allocator, stats: SampleStatistics, seen: Forecast, most: float, target: float, now: Round
-) -> np.ndarray | None:
-    """Return an allocation that lowers the picture's own error to its target; None if it is there."""
-    if now.rmse <= target:
-        return None
-    growth = (now.rmse / (TARGET_MARGIN * max(target, 1e-100))) ** 2
-    return _some(allocator, stats, seen, min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1)), most)
 
 
 def _shown(

@@ -81,7 +81,7 @@ class PixelSequence(mi.Sampler):
 
     group = 2
     fields = 2
-    gain = 0.5
+    gain = 0.4
 
     def __init__(self, props: Any) -> None:
         mi.Sampler.__init__(self, props)

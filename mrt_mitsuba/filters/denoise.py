@@ -118,7 +118,7 @@ def _open_image_denoise(color: Image, albedo: Image | None, normal: Image | None
         if normal is not None:  # which the library takes next to an albedo only
             features["normal"] = np.ascontiguousarray(np.clip(np.nan_to_num(normal), -1, 1), np.float32)
     positive = np.ascontiguousarray(np.maximum(color, 0))
-    return np.asarray(pyoidn.denoise(positive, **features, hdr=True, quality="balanced"))
+    return np.asarray(pyoidn.denoise(positive, **features, hdr=True, quality="fast"))
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from inspect import getclosurevars
 from types import SimpleNamespace
 from typing import Any
@@ -95,9 +96,14 @@ def _render(
 
 
 @pytest.fixture
-def no_top_ups(monkeypatch):
-    """Halves decide for each other once, and not by the error of the picture itself."""
-    monkeypatch.setattr(rounds, "_top_up", lambda *_: None)
+def pilots_alone(monkeypatch):
+    """Rounds whose number of rays, too, is that which pilots foresee."""
+    plan = rounds.plan_round
+
+    def foreseen(allocator: Any, stats: Any, goal: Any, target: Any, now: Any) -> Any:
+        return plan(allocator, stats, goal, target, replace(now, rmse=forecast(stats).rmse))
+
+    monkeypatch.setattr(rounds, "plan_round", foreseen)
 
 
 def _rare(share: float, pixels: int = PIXELS, bright: float = 200) -> Draw:
@@ -114,7 +120,7 @@ def _calm(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
     return 1 + (0.1 + pixel / PIXELS) * rng.normal(size=len(pixel))
 
 
-@pytest.mark.usefixtures("no_top_ups")
+@pytest.mark.usefixtures("pilots_alone")
 @pytest.mark.parametrize("half", [0, 1])
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ ABLATIONS: dict[str, list[Change]] = {
     "PILOT_RATIO 1/6": [(allocate, "PILOT_RATIO", 1 / 6)],
     "GROWTH 8": [(rounds, "GROWTH", 8.0)],
     "no MIN_RAYS": [(rounds, "MIN_RAYS", 0)],
-    "TRUSTED_GROWTH 4": [(rounds, "TRUSTED_GROWTH", 4.0)],
+    "TARGET_MARGIN 1": [(rounds, "TARGET_MARGIN", 1.0)],
     "no SAFETY": [(rounds, "SAFETY", 0.0)],
 }
 
