@@ -54,7 +54,13 @@ class Denoiser:
             means = np.moveaxis(stats.sum[:, :2] / stats.count[:2], 0, -1)  # [2, H, W, 3]
             unfiltered = (stats.film.picture(means[0]), stats.film.picture(means[1]))
         found = denoise(
-            halves[0], halves[1], albedo, normal, encode=stats.metric.encode, unfiltered=unfiltered
+            halves[0],
+            halves[1],
+            albedo,
+            normal,
+            encode=stats.metric.encode,
+            unfiltered=unfiltered,
+            quality="fast",
         )
         plain = stats.image()[..., :3].astype(np.float32)
         more = math.sqrt(stats.curvature(stats.metric))

@@ -195,7 +195,7 @@ def plan_round(
     if caution * now.rmse <= target:
         return None
     wanted = TARGET_MARGIN * target / (caution * now.rmse)
-    # of the ray count, in all pixels alike and in shares; these promise too much, as they follow the pilots' noise
+    # of the ray count, in all pixels alike and in shares, which follow the pilots' noise and promise too much
     alike = wanted**-2
     in_shares = allocator.required_spp(stats, seen, max(wanted * seen.rmse, 1e-100)) / now.spp
     growth = math.sqrt(alike * in_shares) ** (1 / (1 + allocator.gain))

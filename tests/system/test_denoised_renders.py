@@ -38,12 +38,12 @@ def test_the_noisy_mean_is_that_without_denoising(calm):
 
 @pytest.mark.parametrize(("metric", "target"), [("linear", 0.0025), ("relative", 0.008), ("display", 0.0025)])
 def test_a_target_takes_fewer_rays(calm, metric, target):
-    """Four tenths and more; and the true error is in the stated interval of 95 %."""
+    """A third and more; and the true error is in the stated interval of 95 %."""
     truth = np.mean([np.array(mi.render(calm, spp=1024, seed=k)) for k in range(4)], 0)
     options = {"target": target, "metric": metric}
     plain = mrt.render(calm, **options)
     found = mrt.render(calm, denoise=True, **options)
-    assert found.rounds[-1].spp < 0.6 * plain.rounds[-1].spp
+    assert found.rounds[-1].spp < 0.67 * plain.rounds[-1].spp
     assert found.error.metric == metric
     # not by luck: a third of the way from its square to that of the upper end is within the target
     assert (2 * found.error.rmse**2 + found.error.high**2) / 3 <= found.error.target**2

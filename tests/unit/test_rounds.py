@@ -246,9 +246,9 @@ def test_a_filter_makes_a_forecast_less_certain():
 
 
 def test_a_target_takes_rays_enough_to_show_what_is_rare():
-    """256 rays a pixel in a small picture, where the first round reaches the target."""
+    """512 rays a pixel in a small picture, where the first round reaches the target."""
     result = _render(Draws(_calm), target=1e12, rays=5000)
-    assert result.rounds[-1].spp == pytest.approx(256, rel=0.15)
+    assert result.rounds[-1].spp == pytest.approx(512, rel=0.15)
 
 
 def test_no_more_rays_than_allowed_are_spent_where_scouts_met_less_noise():
