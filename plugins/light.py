@@ -60,38 +60,29 @@ class MrtLight(mi.Emitter):
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         dr.make_opaque(self.position)
 
-    def row(self, it: mi.Interaction3f, active: mi.Bool = True) -> list[Any]:
-        """Return position and intensity, the latter at the wavelengths of ``it``.
-
-        A class that derives from this one appends vectors of three, which ``arriving`` then gets.
-        """
+    def _irradiance(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+        """Return the intensity at the wavelengths of ``it``."""
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wavelengths = it.wavelengths
-        return [self.position, self.intensity.eval(si, active)]
-
-    @staticmethod
-    def arriving(d: mi.Vector3f, intensity: mi.UnpolarizedSpectrum, *more: mi.Vector3f) -> Any:
-        """Return the irradiance, at normal incidence, of a point that sees the light along the unit vector
-        ``d``; at most ``intensity``.
-
-        The other arguments are the vectors of ``row`` after the position.
-        """
-        return intensity
+        return self.intensity.eval(si, active)
 
     def fixed_row(self) -> list[list[float]] | None:
-        """Return ``row`` as plain numbers; None where they vary, or where derivatives are wanted."""
-        row = None if varies(self.intensity) else self.row(dr.zeros(mi.Interaction3f))
-        if row is None or dr.grad_enabled(row):
+        """Return position and intensity as plain numbers; None where they vary, or where derivatives are
+        wanted.
+        """
+        if varies(self.intensity):
+            return None
+        row = [self.position, self._irradiance(dr.zeros(mi.Interaction3f))]
+        if dr.grad_enabled(row):
             return None
         return [(3 * [first(x) for x in part])[:3] for part in row]  # of a single channel, three
 
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-        position, *more = self.row(it, active)
-        ds = towards(position, it)
+        ds = towards(self.position, it)
         ds.emitter = pointer("Emitter", self)
-        return ds, mi.depolarizer(self.arriving(ds.d, *more))
+        return ds, mi.depolarizer(self._irradiance(it, active))
 
     def pdf_direction(
         self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
@@ -101,7 +92,7 @@ class MrtLight(mi.Emitter):
     def eval_direction(
         self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool = True
     ) -> mi.Spectrum:
-        return mi.depolarizer(dr.select(active, self.arriving(ds.d, *self.row(it, active)[1:]), 0))
+        return mi.depolarizer(dr.select(active, self._irradiance(it, active), 0))
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         return mi.Spectrum(0)

@@ -27,9 +27,8 @@ class Reading:
     """A snapshot of a scene and the facts in it; ``cache`` holds those of parts that have not changed since.
 
     What the kernels may do in place of calling a plugin is known by its class: an ``MrtPlane`` has an
-    equation, an ``AxialMesh`` or ``MrtGroup`` stands for quadrics, an ``MrtBSDF`` is a row of a table, and so
-    is a light that derives from ``MrtLight``. A class of somebody else's that derives from one of the others
-    may do anything, and is called.
+    equation, an ``AxialMesh`` or ``MrtGroup`` stands for quadrics, an ``MrtBSDF`` or ``MrtLight`` is a row of
+    a table. A class of somebody else's that derives from one of these may do anything, and is called.
     """
 
     def __init__(self, snapshot: Snapshot, cache: Cache) -> None:

@@ -1,8 +1,4 @@
-"""The lights of a scene, as rows of a table in place of calls to plugins where they are known.
-
-A light of the table is an ``mrt_light``, or one of a class that derives from ``plugin("light").MrtLight``,
-appends to its ``row`` and overrides ``arriving``.
-"""
+"""The lights of a scene: positions and intensities, in place of calls where all are ``mrt_light``."""
 
 from __future__ import annotations
 
@@ -37,8 +33,8 @@ def towards(position: mi.Point3f, it: mi.Interaction3f) -> mi.DirectionSample3f:
 
 def light_rows(lights: list[mi.Emitter]) -> list[list[list[float]]] | None:
     """Return the ``fixed_row`` of each light, vectors of three; None where one has no place in a table."""
-    kinds = classes_of("lights")
-    if not is_jit() or mi.is_spectral or not all(isinstance(light, kinds) for light in lights):
+    kinds = classes_of("lights")  # one of a class that derives from it may be anything
+    if not is_jit() or mi.is_spectral or not all(type(light) in kinds for light in lights):
         return None
     rows = [light.fixed_row() for light in lights]
     return None if None in rows else rows
@@ -53,43 +49,25 @@ class Lights:
         self.called: Any = lights if rows is None else None
         if form == "loop":
             self.called = pointer("Emitter", lights)
-        elif form != "none" and rows is not None:
-            self.kind_of = [type(light) for light in lights]
-            #: the kinds that the kernel holds, and how many vectors a row of each has
-            self.kinds = dict(zip(self.kind_of, map(len, rows), strict=True))
-            if form == "table":
-                kinds = list(self.kinds)
-                parts = np.zeros((1 + max(self.kinds.values()), len(lights), 3))
-                for k, row in enumerate(rows):
-                    parts[0, k] = kinds.index(self.kind_of[k])
-                    parts[1 : 1 + len(row), k] = row
-                self.parts = [Table(mi.Vector3f, part) for part in parts]
-            else:
-                self.rows = [[dr.opaque(mi.Vector3f, part) for part in row] for row in rows]
+        elif form == "table" and rows is not None:
+            self.table = Table(mi.Vector3f, rows)
+        elif rows is not None:
+            self.rows = [[dr.opaque(mi.Vector3f, part) for part in row] for row in rows]
 
     def sample(
         self, light: Any, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.UnpolarizedSpectrum]:
         """Return the direction from ``it`` to light number ``light``, and the light that arrives."""
-        number: Any = None  # of the kind, where there are several
         if self.called is not None:
             called = self.called
             one = called[light] if self.unrolled else dr.gather(mi.EmitterPtr, called, light, active)
             return one.sample_direction(it, sample, active)
         if self.unrolled:
-            kinds = [self.kind_of[light]]
-            row = self.rows[light]
+            position, color = self.rows[light]
         else:
-            kinds = list(self.kinds)
-            row = [part(light, active) for part in self.parts[1:]]
-            number = self.parts[0](light, active).x if len(kinds) > 1 else None
-        position, color, *more = row
-        ds = towards(mi.Point3f(position), it)
+            position, color = (self.table(light, active, part) for part in range(2))
         intensity = mi.UnpolarizedSpectrum(list(color)[: dr.size_v(mi.UnpolarizedSpectrum)])
-        arriving, *others = (kind.arriving(ds.d, intensity, *more[: self.kinds[kind] - 2]) for kind in kinds)
-        for k, other in enumerate(others, start=1):
-            arriving = dr.select(number == k, other, arriving)
-        return ds, arriving
+        return towards(mi.Point3f(position), it), intensity
 
 
 def brightness(emitter: mi.Emitter) -> float:

@@ -154,7 +154,7 @@ def set_level(loaded: mi.Scene, where: str, level: float) -> None:
 
 
 def foreign_light(where: str) -> str:
-    """Register a light of the table whose numbers are kept in the same places."""
+    """Register a light that derives from ours, whose numbers are kept in the same places."""
 
     class Dimmed(plugin("light").MrtLight):  # type: ignore[misc]
         shared: ClassVar = [0.2]
@@ -166,12 +166,9 @@ def foreign_light(where: str) -> str:
         def level(self) -> float:
             return {"instance": self.own, "class": type(self).shared, "module": LEVEL}[where][0]
 
-        def row(self, it: Any, active: Any = True) -> list[Any]:
-            return [*super().row(it, active), mi.Vector3f(self.level())]
-
-        @staticmethod
-        def arriving(d: Any, intensity: Any, *more: Any) -> Any:
-            return intensity * more[0].x
+        def sample_direction(self, *given: Any) -> tuple[Any, Any]:
+            ds, weight = super().sample_direction(*given)
+            return ds, weight * dr.opaque(mi.Float, self.level())
 
     mi.register_emitter(f"dimmed_{where}", Dimmed)
     return f"dimmed_{where}"
