@@ -320,34 +320,6 @@ def test_a_checked_plugin_is_named_and_let_go(answer, loaded):
         gc.enable()
 
 
-CHECKERS = {"type": "checkerboard"}
-
-
-@pytest.mark.parametrize(
-    ("bsdf", "method"),
-    [
-        ({"type": "bumpmap", "texture": CHECKERS, "bsdf": {"type": "diffuse"}}, "eval_1_grad"),
-        (
-            {"type": "twosided", "nested": {"type": "diffuse", "reflectance": {"type": "bare"}}},
-            "eval",
-        ),
-    ],
-    ids=["bumps", "two deep"],
-)
-def test_a_nested_texture_without_a_method_is_skipped(bsdf, method):
-    """No law of the BSDF is broken by a texture that does not support it."""
-
-    class Bare(mi.Texture):
-        def __init__(self, props):
-            mi.Texture.__init__(self, props)
-
-    mi.register_texture("bare", Bare)
-    check = mrt.check_bsdf(bsdf, quick=True)
-    assert check.failed == [] and not check.passed, str(check)
-    reasons = {law.skipped for law in check.laws.values() if "nested in it has no" in law.skipped}
-    assert reasons and all(f"{method}" in reason for reason in reasons), str(check)
-
-
 def test_a_number_counts_as_a_color():
     """As for Mitsuba, which also takes a list for a tuple."""
 

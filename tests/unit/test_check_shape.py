@@ -238,27 +238,3 @@ def test_snippets_are_programs(capsys):
             if part.criterion != "reads":
                 exec(compile(part.snippet, "snippet", "exec"), {})
                 assert capsys.readouterr().out
-
-
-SHEAR = np.array([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-
-
-@pytest.mark.parametrize("matrix", [SHEAR, np.diag([1, 2, 3, 1])], ids=["sheared", "scaled"])
-@pytest.mark.parametrize("loaded", [False, True], ids=["dict", "loaded"])
-def test_what_mitsuba_does_not_support_is_skipped(matrix, loaded):
-    """Mitsuba warns of shear, and of a scale that differs by axis: no law can hold then."""
-    level = mi.log_level()
-    given = {"type": "cylinder", "to_world": mi.ScalarTransform4f(matrix)}
-    check = mrt.check_shape(mi.load_dict(given) if loaded else given, quick=True)
-    assert check.failed == [] and not check.passed
-    assert all("Mitsuba does not support it" in law.skipped for law in check.laws.values())
-    assert "shouldn't contain" in check.laws["hits"].skipped
-    assert mi.log_level() == level
-
-
-def test_what_mitsuba_supports_is_not_skipped():
-    moved = {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([1, 2, 3]).scale(0.2)}
-    sheared = {"type": "disk", "to_world": mi.ScalarTransform4f(SHEAR)}
-    for given in (moved, sheared):
-        for shape in (given, mi.load_dict(given)):
-            assert mrt.check_shape(shape, quick=True, only=["hits"]).passed

@@ -58,8 +58,6 @@ class Case:
         else:
             self.name = class_name(given)
             self.plugin = given
-        # the transform that Mitsuba warns of
-        self.unsupported = _refused(self.plugin) if isinstance(self.plugin, mi.Shape) else ""
 
     def with_(self, **changes: Any) -> Description:
         """The dict with other values of some parameters. Raises ``Skip`` without one."""
@@ -219,32 +217,6 @@ def class_name(plugin: mi.Object) -> str:
     """Name of a plugin's class: Mitsuba calls all those in Python by that of their base."""
     python = type(plugin).__module__.split(".")[0] != "mitsuba"
     return type(plugin).__name__ if python or not hasattr(plugin, "class_name") else plugin.class_name()
-
-
-def _refused(shape: mi.Shape) -> str:
-    """What Mitsuba warns of in the transform of a stock shape, "" if nothing.
-
-    A shape of the same kind is loaded while warnings are errors.
-    """
-    params = mi.traverse(shape)
-    stock = type(shape).__module__.startswith("mitsuba")
-    if not stock or "to_world" not in params:
-        return ""
-    matrix = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
-    kind = class_name(shape).lower()
-    logger = mi.logger()
-    levels = logger.log_level(), logger.error_level()
-    logger.set_log_level(mi.LogLevel.Warn)
-    logger.set_error_level(mi.LogLevel.Warn)
-    try:
-        mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix)})
-    except RuntimeError as problem:
-        _, transform, words = str(problem).partition("'to_world' transform shouldn't")
-        return f"Mitsuba does not support it: {transform}{words}" if words else ""
-    finally:
-        logger.set_log_level(levels[0])
-        logger.set_error_level(levels[1])
-    return ""
 
 
 def _kept(value: Given) -> Given:

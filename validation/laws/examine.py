@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import io
-import re
 import threading
 import time
 import warnings
@@ -51,7 +50,7 @@ def examine(
     with settings_restored():
         case = kind(given, quick, seed)
     checked = {}
-    obstacle = case.unsupported  # why the laws that are left cannot be judged
+    obstacle = ""  # why the laws that are left cannot be judged
     for name in laws:
         if name in chosen:
             checked[name] = outcome = Outcome(laws[name], program=case.program)
@@ -79,11 +78,7 @@ def _judge(outcome: Outcome, case: Case, obstacle: str, timeout: float) -> str:
         outcome.fail(f"it {late}", "a plugin must come to an end", timeout)
         return f"a law before it {late}"
     except Exception as error:
-        missing = _missing_inside(case.plugin, error)
-        if missing:
-            outcome.skip(missing)
-        else:
-            outcome.fail(f"it raised {type(error).__name__}: {reason_of(error)}", "a plugin must not raise")
+        outcome.fail(f"it raised {type(error).__name__}: {reason_of(error)}", "a plugin must not raise")
     return ""
 
 
@@ -99,18 +94,6 @@ def _run(program: str, names: dict[str, object]) -> str:
         finally:
             names.clear()  # its functions refer to it, and it to the plugin: a cycle keeps that registered
     return printed.getvalue()
-
-
-_NOT_IMPLEMENTED = re.compile(r"\[(\w+)\] \w+::(\w+)\(\).*not implemented")
-_PURE_VIRTUAL = re.compile(r"(\w+)::(\w+)\(\)'\): tried to call a pure virtual")
-
-
-def _missing_inside(plugin: mi.Object, error: Exception) -> str:
-    """Which method a plugin nested in this one lacks, if an error is about that; else ""."""
-    match = _NOT_IMPLEMENTED.search(str(error)) or _PURE_VIRTUAL.search(str(error))
-    if match is None or match[1] in [base.__name__ for base in type(plugin).__mro__]:
-        return ""
-    return f"the {match[1]} nested in it has no {match[2]}(), which it needs"
 
 
 @contextlib.contextmanager
