@@ -21,6 +21,7 @@ from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
 from mrt_mitsuba.files.images import read_channels, write_exr, write_png
 from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.rendering.api import Result
+from mrt_mitsuba.validation.laws.law import sidak
 
 Array = np.ndarray
 Picture = Any  # the path of an EXR, an array or the result of a render
@@ -325,11 +326,6 @@ def averaged(pictures: ArrayLike) -> tuple[Array, Array]:
     pictures = np.asarray(pictures)
     mean = pictures.mean(axis=0, dtype=np.float64)
     return np.asarray(mean), pictures.var(axis=0, ddof=1).mean(axis=-1) / len(pictures)
-
-
-def sidak(p: float, count: int) -> float:
-    """Return the probability 1 - (1 - p)^count that the smallest of ``count`` p values is ``p`` or less."""
-    return 1.0 if p >= 1 else float(-np.expm1(count * np.log1p(-p)))
 
 
 def cell_sums(values: Array, size: int) -> Array:

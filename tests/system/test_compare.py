@@ -272,7 +272,7 @@ picture = np.full((4, 4, 3), 0.5, np.float32)
 scene = mrt.scene_dict(0, width=8, height=6)
 case = {"aa": 1, "aamode": "none"}
 few = {"size": 8, "spp": 1, "renders": 2, "pairs": 100}
-times = {"reference": case | {"aa": 2}, "repeats": 2, "cold": False}
+times = {"reference": case | {"aa": 2}, "repeats": 2}
 doors = {
     "check": lambda: mrt.check_bsdf({"type": "diffuse"}, quick=True, only=["eval_pdf"]).save("check"),
     "page": lambda: mrt.check_emitter({"type": "constant"}, quick=True, only=["density"])._repr_html_(),

@@ -83,7 +83,6 @@ for kind_of_plugin, its_laws in power.KINDS.items():
 
 @pytest.mark.parametrize(("kind", "fault"), FOUND)
 def test_faults_three_times_as_large_as_documented_are_found(kind, fault, variant):
-    power.register(runtime.SLOW, variant)
     quick = np.isfinite(fault.quick)
     size = 3 * (fault.quick if quick else fault.full)
     check = power.KINDS[kind].check_fault(fault, size, quick=quick)

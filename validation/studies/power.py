@@ -1,4 +1,4 @@
-"""The power of the laws: plugins with the faults that stand with each law, and the least size found."""
+"""The power of the laws: plugins with the faults that stand with each law."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import mitsuba as mi
-import numpy as np
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.validation.laws import bsdf, emitter, shape
@@ -157,10 +156,12 @@ def changed_sky(changes):
 
 
 def faulty_bsdf(nested, **changes):
-    """The dict of a BSDF with a change; several may be in use, each under a number. Needs ``register``."""
-    number = str(len(FAULTY))
-    (FAULTY[number],) = changes.items()
-    return {"type": "faulty", "change": number, "nested": nested or {"type": "diffuse"}}
+    """The dict of a BSDF with a change, which the next one replaces; it loads in the scalar variant, too."""
+    (change,) = changes.items()
+    for variant in (runtime.SLOW, mi.variant()):
+        runtime.use(variant)
+        mi.register_bsdf("faulty", changed_bsdf({"": change}))
+    return {"type": "faulty", "change": "", "nested": nested or {"type": "diffuse"}}
 
 
 def faulty_sky(nested, **changes):
@@ -186,19 +187,7 @@ class Kind:
         changes = {name: partial(change, size) for name, change in fault.changes.items()}
         return self.check(self.faulty(fault.nested, **changes), only=[fault.law], quick=quick)
 
-    def least_found(self, fault: Fault, *, quick: bool) -> float:
-        """The least size that fails, tried from three times that in the table down; infinity for none."""
-        least = np.inf
-        for factor in FACTORS:
-            size = factor * (fault.quick if quick else fault.full)
-            if np.isinf(size) or not self.check_fault(fault, size, quick=quick).failed:
-                break
-            least = size
-        return float(least)
 
-
-FACTORS = (3, 2, 1, 0.5, 0.3, 0.1)
-FAULTY: dict[str, Change] = {}  # by number, the change of the BSDF "faulty"
 KINDS = {
     "BSDF": Kind(check_bsdf, bsdf.LAWS, faulty_bsdf),
     "shape": Kind(check_shape, shape.LAWS, ChangedShape),
@@ -206,17 +195,7 @@ KINDS = {
 }
 
 
-def register(*variants: str) -> None:
-    """Register the BSDF "faulty" in variants; the last one becomes current."""
-    for variant in variants:
-        runtime.use(variant)
-        mi.register_bsdf("faulty", changed_bsdf(FAULTY))
-
-
-Row = dict[str, str]
-
-
-def statements() -> list[Row]:
+def statements() -> list[dict[str, str]]:
     """A row for each law, which states it by the first line of its docstring, in Markdown."""
     rows = []
     for name, kind in KINDS.items():
@@ -226,22 +205,12 @@ def statements() -> list[Row]:
     return rows
 
 
-def stated() -> list[Row]:
+def stated() -> list[dict[str, str]]:
     """A row for each fault, with the least sizes that its law is said to find."""
-    return [
-        row(name, fault, fault.quick, fault.full) for name, kind in KINDS.items() for fault in kind.faults
-    ]
-
-
-def row(plugin: str, fault: Fault, quick: float, full: float) -> Row:
-    sizes = {"quick": quick, "full": full}
-    shown = {name: "not found" if np.isinf(size) else f"{size:.1g}" for name, size in sizes.items()}
-    return {"plugin": plugin, "law": f"`{fault.law}`", "fault": fault.what, **shown}
-
-
-if __name__ == "__main__":  # measures them
-    register(runtime.SLOW, runtime.FAST)
+    rows = []
     for name, kind in KINDS.items():
         for fault in kind.faults:
-            least = (kind.least_found(fault, quick=quick) for quick in (True, False))
-            print(*row(name, fault, *least).values(), sep=" | ", flush=True)
+            quick, full = (f"{size:.1g}".replace("inf", "not found") for size in (fault.quick, fault.full))
+            what = {"plugin": name, "law": f"`{fault.law}`", "fault": fault.what}
+            rows.append({**what, "quick": quick, "full": full})
+    return rows
