@@ -1,4 +1,4 @@
-"""Reading the files of a scene: bytes, lines, elements, and where the files they name are."""
+"""Reading the files of a scene: bytes, lines, and where the files they name are."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 from mrt_mitsuba.errors import SceneError, warn
 from mrt_mitsuba.options import StrPath
 
-MAX_DEPTH = 256  # maximum levels of nesting; Mitsuba's parser overflows its stack from about 3000 on
 MAX_LINE_BYTES = 2**18  # bytes, about 40,000 corners of a face
 _CONTINUED = b"\\\n"  # at the end of a line that goes on in the next
 MISSING = "is missing or may not be read in"  # text of messages about missing files
@@ -101,35 +100,3 @@ def warn_of(findings: Mapping[str, list[str]]) -> None:
         more = f"; {len(texts) - 1} more {kind} likewise" if texts[1:] else ""
         if texts:
             warn(f"{texts[0]}{more}")
-
-
-def elements(file: str) -> list[tuple[str, dict[str, str]]]:
-    """Return tag and attributes of each element of an XML file, in order."""
-    from xml.parsers import expat
-
-    require_file(file)
-    read: list[tuple[str, dict[str, str]]] = []
-    around: list[str] = []  # tags that are still open
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        around.append(tag)
-        read.append((tag, attributes))
-        if len(around) > MAX_DEPTH:
-            raise SceneError(f"cannot load {file}: it is nested more than {MAX_DEPTH} levels deep")
-
-    def end(tag: str) -> None:
-        around.pop()
-
-    def entity(name: str, *declaration: object) -> None:  # which Mitsuba's parser reads in another way
-        raise SceneError(f"cannot load {file}: it declares the entity {name}; write the text in its place")
-
-    parser = expat.ParserCreate("utf-8")
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.EntityDeclHandler = entity
-    try:
-        with open(file, "rb") as stream:
-            parser.ParseFile(stream)
-    except expat.ExpatError as error:
-        raise SceneError(f"cannot load {file}: it must be XML in UTF-8, but has {error}") from None
-    return read

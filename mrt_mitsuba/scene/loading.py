@@ -3,8 +3,8 @@
 Mitsuba takes a plugin from ``plugins/NAME.so`` in the first folder of its file resolver that has one, and the
 folders of a scene and of the process come before its own: a file that lies there would run as native code.
 Here Mitsuba's own folder comes first, and a plugin that only another folder has is refused; the other folders
-serve for data. Files that are read without an end (pipes, devices) and elements nested so deep that Mitsuba's
-parser would end the process are refused as well.
+serve for data. Files that are read without an end (pipes, devices) are refused as well, and dicts for which
+Mitsuba 3.9 would end the process.
 
 Objects are made one after the other. In parallel, Mitsuba makes Python objects inside each other, to the
 limit of the stack, and Dr.Jit's messages may deadlock; loading them one by one takes no longer.
@@ -18,7 +18,7 @@ import difflib
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -29,11 +29,9 @@ from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home
 from mrt_mitsuba.options import Values
-from mrt_mitsuba.scene.files import MAX_DEPTH, elements, require_file
+from mrt_mitsuba.scene.files import require_file
 
-MAX_INCLUDE_DEPTH = 15  # files that include each other; Mitsuba refuses more
-MAX_INCLUDES = 1000
-MAX_SUBSTITUTED = 2**24  # maximum characters that all substitutions of a file add up to
+MAX_DEPTH = 256  # maximum levels of nesting of a dict; Mitsuba overflows its stack from some thousands on
 MAX_SAMPLE_COUNT = 2**24  # maximum spp; some samplers divide by zero at 0, or never end at 2^31
 
 # A traceback, all indented except its first line, with the type of this project's error; and the place in
@@ -90,21 +88,25 @@ def load_file(
     budget = budget or Budget.of(None)
     keys = {key: value for key, value in params.items() if "." in key}
     given = {name: str(value) for name, value in params.items() if name not in keys}
+    offered = {name: str(value) for name, value in (options or {}).items() if value is not None} | given
     with _loading(path, os.path.dirname(path) or "."):
-        xml = XmlParameters(given, options or {}, budget.inputs)
-        xml.read(path)
-        xml.check(path)
-        passed = {name: xml.values[name] for name in xml.used - xml.declared}
-        state = mi.parser.parse_file(mi.parser.ParserConfig(mi.variant()), path, **passed)
+        config = mi.parser.ParserConfig(mi.variant())
+        config.unused_parameters = mi.LogLevel.Debug  # a file has few of the options
+        state = mi.parser.parse_file(config, path, **offered)
+        budget.inputs.update(map(str, state.files))
+        text = "".join(Path(str(file)).read_text(errors="replace") for file in state.files)
+        defaults = dict(re.findall(r'<default\s+name="(\w+)"\s+value="([^"]*)"', text))
+        _check_parameters(path, given, {*defaults, *re.findall(r"\$(\w+)", text)})
         _check_nodes(state.nodes, budget)
+        values = defaults | offered
         if not as_text:
-            return _instantiate(state, True, keys), xml.values
+            return _instantiate(state, True, keys), values
         for node in state.nodes:
             if isinstance(node.props.get("filename", None), str):
                 node.props["filename"] = os.path.abspath(_resolved(node.props["filename"]))
         if strange := _set_properties(state, keys):
             raise UsageError(f"{path} does not state {min(strange)}: write it into the file")
-        return mi.parser.write_string(state), xml.values
+        return mi.parser.write_string(state), values
 
 
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------
@@ -277,72 +279,9 @@ def _check_dict(node: Values, inputs: set[str], place: str = "", depth: int = 1)
             _check_data(value, inputs)
 
 
-@dataclass
-class XmlParameters:
-    """The ``$parameters`` of an XML file, read with what it includes before Mitsuba opens any of them.
-
-    Parameters are substituted in the order of Mitsuba's parser: this gives the names of included files, and
-    bounds the length of the text.
-    """
-
-    given: Mapping[str, str]
-    options: Values  #: of a render; one that is given is the value of a parameter of its name
-    inputs: set[str]  #: paths of the files found
-    values: dict[str, str] = field(default_factory=dict)  #: given, of options, and defaults as declared
-    used: set[str] = field(default_factory=set)
-    declared: set[str] = field(default_factory=set)  #: whose value is the default
-    length: int = 0  #: characters substituted so far
-    includes: int = 0
-
-    def __post_init__(self) -> None:
-        self.values |= self.given
-
-    def read(self, path: str, depth: int = 0) -> None:
-        """Read a file and, in order, those that it includes. Raises ``RuntimeError``."""
-        self.inputs.add(path)
-        for tag, raw in elements(path):
-            attributes = {key: self._substituted(text) if "$" in text else text for key, text in raw.items()}
-            name = attributes.get("name", "")
-            if tag == "default" and name not in self.values:
-                option = self.options.get(name)
-                self.values[name] = attributes.get("value", "") if option is None else str(option)
-                if option is None:
-                    self.declared.add(name)
-            elif tag == "path":
-                mitsuba_first(_resolved(attributes.get("value", "")))
-            elif tag != "default" and attributes.get("filename"):
-                file = _check_data(attributes["filename"], self.inputs)
-                if tag == "include" and os.path.isfile(file) and depth < MAX_INCLUDE_DEPTH:
-                    self._include(file, depth + 1)
-
-    def _include(self, file: str, depth: int) -> None:
-        self.includes += 1
-        if self.includes > MAX_INCLUDES:
-            raise RuntimeError(f"it includes more than {MAX_INCLUDES} files")
-        outside = mi.file_resolver()
-        mitsuba_first(os.path.dirname(file))  # an included file's own includes are relative to it
-        self.read(file, depth)
-        mi.set_file_resolver(outside)
-
-    def _substituted(self, text: str) -> str:
-        """Return the text of an attribute with its parameters substituted."""
-        for name in re.findall(r"\$(\w+)", text):
-            if name not in self.values and self.options.get(name) is not None:
-                self.values[name] = str(self.options[name])
-        for name in sorted(filter(None, self.values), key=len, reverse=True):  # the longest first, as Mitsuba
-            pieces = re.split(rf"(?<!\\)\${re.escape(name)}", text)
-            if pieces[1:]:
-                self.used.add(name)
-                self.length += len(pieces) * len(self.values[name])
-                if self.length > MAX_SUBSTITUTED:
-                    raise RuntimeError(f"its parameters come to more than {MAX_SUBSTITUTED} characters")
-                text = self.values[name].join(pieces)
-        return text
-
-    def check(self, path: str) -> None:
-        """Raise ``UsageError`` for a parameter that was given and is used in no file."""
-        for name in self.given.keys() - self.used - {"focaldist", "focalrange"}:
-            known = {*self.used, *self.declared}
-            close = difflib.get_close_matches(name, [*known, *self.options], n=1)
-            hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(sorted(known)) or 'none'}"
-            raise UsageError(f"{path} has no parameter ${name}: {hint}")
+def _check_parameters(path: str, given: Iterable[str], known: set[str]) -> None:
+    """Raise ``UsageError`` for a parameter that is in no file."""
+    for name in set(given) - known - {"focaldist", "focalrange"}:
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(sorted(known)) or 'none'}"
+        raise UsageError(f"{path} has no parameter ${name}: {hint}")

@@ -82,10 +82,8 @@ refused("out", "links lead in a circle", {"out.exr": Path("b.exr"), "b.exr": Pat
 refused("export 8 --xml out.xml", "out_mesh_0.ply: it is a folder", {"out_mesh_0.ply": None})
 linked_mtl = textured(WHITE) | {"out.exr": Path("a.mtl")}
 linked_scene = xml("") | {"l.xml": Path("a.xml")}
-measured = xml(SPECTRUM) | {"s.spd": "4 1\n7 1\n"}
 refused("out scene=a.obj", "out.exr: what is written is made", linked_mtl)
 refused("export scene=l.xml --xml ./a.xml", "a.xml: what is written is", linked_scene)
-refused("export scene=a.xml --xml s.spd", "s.spd: what is written", measured)
 misused("export scene=a.xml --xml b.xml --stock", "flavor=stock is of no use with an XML file", xml(""))
 
 misused("out width=16384 height=16384 aa=1 memory=512M", "needs 4.1 GiB of memory, and 512 MiB")
@@ -133,18 +131,15 @@ misused("sweep out a.toml", "out cannot be set in a file", toml("out = 'x'"))
 
 NAMED = "<string name='filename' value='{}'/>"
 TEXTURED = "<shape type='sphere'><bsdf type='{}'><texture name='{}' type='{}'>{}</texture></bsdf></shape>"
-PIPES = {"in": None, "pipe": PIPE, "in/spectrum": PIPE}
+PIPES = {"pipe": PIPE}
 
 
 def unending(inside: str) -> None:
     refused("out scene=a.xml", "not a regular file", xml(inside.format("pipe")) | PIPES)
 
 
-unending("<include filename='{}'/>")
-unending("<include filename='p&#105;pe'/>")
 unending(f"<emitter type='envmap'>{NAMED}</emitter>")
 unending(f"<shape type='ply'>{NAMED}</shape>")
-unending(f"<path value='in'/>{SPECTRUM.replace('s.spd', 'spectrum')}")
 for kind in ("mrt_texture", "bitmap"):
     unending(TEXTURED.format("mrt_bsdf", "diffuse_reflectance", kind, NAMED))
 
