@@ -21,8 +21,8 @@ import numpy as np
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.options import StrPath, check
 from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
-from mrt_mitsuba.scene.model import BLUE_SKY, CONVENTION, Camera, Color, Light, Mesh, Scene, Vector
-from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, MtlMaterial, find_material, read_mtl
+from mrt_mitsuba.scene.model import BLUE_SKY, CONVENTION, Camera, Light, Material, Mesh, Scene, Vector
+from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, find_material, read_mtl
 from mrt_mitsuba.scene.polygons import triangulate
 
 # Numbers of each kind of values that are used: positions may have a weight, a colour or both behind them
@@ -95,7 +95,7 @@ def read_obj(path: StrPath, *, convention: str = "report") -> tuple[tuple[Mesh, 
     for block in _BLOCKS.finditer(read_text(reader.path)):
         reader.read(block)
         reader.line += block[0].count(b"\n")
-    textures = filter(None, (each.material.texture for each in reader.materials.values()))
+    textures = filter(None, (each.texture for each in reader.materials.values()))
     return reader.meshes(), frozenset({os.fspath(path), *reader.libraries, *textures})
 
 
@@ -112,7 +112,7 @@ class _Reader:
         # kinds]; the kinds, as in ``_CORNERS``; the material; the first line
         self.faces: list[tuple[np.ndarray, list[int], str, int]] = []
         self.material = ""
-        self.materials: dict[str, MtlMaterial] = {}
+        self.materials: dict[str, Material] = {}
         self.named: dict[str, str] = {}  # by the name of a material, where it was used first
         self.libraries: set[str] = set()
         self.statements: set[str] = set()  # names of libraries that were looked for
@@ -144,8 +144,6 @@ class _Reader:
             self.faces.append((faces, kinds, self.material, self.line))
             return
         values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)
-        if kind == "v" and values.shape[1] > 4 and "vertices" not in self.findings:
-            self.note("vertices", "colours of vertices are not used")
         values = values[:, : _USED[kind]]
         used = np.zeros((lines, _USED[kind]), np.float32)
         with np.errstate(over="ignore"):
@@ -205,7 +203,7 @@ class _Reader:
             if found[text] is None
         ]
         values = [np.concatenate(arrays) for arrays in self.values.values()]
-        parts: dict[tuple[MtlMaterial, bool], list[np.ndarray]] = {}
+        parts: dict[tuple[Material, bool], list[np.ndarray]] = {}
         for faces, kinds, name, line in self.faces:
             counts = np.array([*self.counts.values()])[kinds]
             for row, corner, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
@@ -217,9 +215,9 @@ class _Reader:
                         f"a {kind} index of 0, or before the first; indices count from 1, or back from -1"
                     )
                 self.fail(f"f has {problem}", line + row)
-            used = self.materials.get(found.get(name) or "", MtlMaterial(DEFAULT_MATERIAL))
+            used = self.materials.get(found.get(name) or "", DEFAULT_MATERIAL)
             if 1 not in kinds:  # no coordinates to look it up
-                used = MtlMaterial(replace(used.material, texture=None, texture_range=(0.0, 1.0)))
+                used = replace(used, texture=None)
             corners = np.zeros((*faces.shape[:2], len(_USED)), np.int64)  # [F, corners, kinds]
             corners[:, :, kinds] = faces
             cut, crossing = triangulate(values[0][corners[:, :, 0]])
@@ -235,24 +233,22 @@ class _Reader:
         return tuple(_mesh(values, np.concatenate(cuts), *which) for which, cuts in parts.items())
 
 
-def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, used: MtlMaterial, smooth: bool) -> Mesh:
+def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Material, smooth: bool) -> Mesh:
     """Return the mesh of triangles [T, 3, kinds of values], with the vertices that they use."""
     points, uvs, normals = values
-    material = used.material
     v, vt, vn = np.moveaxis(triangles, -1, 0)
     if material.texture is None and not smooth:
         kept = np.zeros(len(points), bool)
         kept[v] = True
         new = np.cumsum(kept, dtype=np.uint32) - np.uint32(1)  # the vertices used, in their order
         return Mesh(points[kept], new[v], material)
-    scale, offset = np.array([used.scale, used.offset], np.float32)
     # Each corner becomes a vertex: a point may have another texture or normal in another triangle
     faces = np.arange(v.size, dtype=np.uint32).reshape(-1, 3)
     return Mesh(
         vertices=points[v.ravel()],
         faces=faces,
         material=material,
-        uvs=None if material.texture is None else uvs[vt.ravel()] * scale + offset,
+        uvs=None if material.texture is None else uvs[vt.ravel()],
         normals=normals[vn.ravel()] if smooth else None,
     )
 
@@ -266,15 +262,13 @@ def obj_scene(
     convention: str = "report",
     texturing: str | None = None,
     light: Vector | None = None,
-    lights: Sequence[Light] | None = None,
-    sky: Color = BLUE_SKY,
     **view: Any,
 ) -> Scene:
     """Return the scene of an OBJ file; by default, camera and lights are placed by the model's size.
 
     The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
     on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. ``light``: where
-    a single white light is, instead of ``lights``; ``view``: ``camera``, ``target`` and ``up`` (vectors) and
+    a single white light is, instead of these two; ``view``: ``camera``, ``target`` and ``up`` (vectors) and
     ``fov`` (horizontal, in degrees), as ``render`` takes them. Raises ``UsageError`` for a camera that sees
     nothing, and what ``read_obj`` raises.
     """
@@ -288,7 +282,7 @@ def obj_scene(
     center, eye, right, left = map(tuple, places.tolist())
     if light is not None:
         lights = [Light(light, (2.5, 2.5, 2.5))]
-    elif lights is None:
+    else:
         lights = [Light(right, (2.5, 2.5, 2.5)), Light(left, (1.0, 1.0, 1.2))]
     fields = {"camera": "position", "fov": "hfov"}
     given = {fields.get(name, name): value for name, value in view.items()}
@@ -299,7 +293,7 @@ def obj_scene(
     return Scene(
         title=os.path.basename(path),
         camera=camera,
-        sky=sky,
+        sky=BLUE_SKY,
         lights=tuple(lights),
         meshes=meshes,
         texturing=texturing or convention,
