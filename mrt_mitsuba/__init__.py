@@ -57,9 +57,7 @@ def __getattr__(name: str) -> object:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from mrt_mitsuba.interrupts import defer_signals
-    from mrt_mitsuba.machine import check_start
 
-    check_start()
     with _errors.needs_extra(), defer_signals():
         module = import_module(_HOME[name])
     globals()[name] = value = getattr(module, name, module)  # ``filters`` is a module

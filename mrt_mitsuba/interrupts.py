@@ -18,7 +18,6 @@ from typing import Any
 
 _handler: Callable[..., Any] | None = None  # of SIGINT, while it is deferred
 _pending = False
-_thread = 0  # the thread that defers it
 
 
 @contextlib.contextmanager
@@ -28,12 +27,11 @@ def defer_signals() -> Iterator[None]:
     No effect inside another such block, where SIGINT is ignored, and in threads other than the main one,
     which get no signals.
     """
-    global _handler, _pending, _thread
+    global _handler, _pending
     handler = signal.getsignal(signal.SIGINT)
     if _handler or not callable(handler) or threading.current_thread() is not threading.main_thread():
         yield
         return
-    _thread = threading.get_ident()
     _pending = False
     _handler = handler
     try:
@@ -60,18 +58,6 @@ def deliver_pending() -> None:
 def _note(number: int, frame: FrameType | None) -> None:
     global _pending
     _pending = True
-
-
-def _forked() -> None:
-    """Stop deferring in a process forked by another thread, where the block never ends."""
-    global _handler
-    if _handler and threading.get_ident() != _thread:
-        signal.signal(signal.SIGINT, _handler)
-        _handler = None
-
-
-if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_forked)
 
 
 def interrupt_behind(error: BaseException) -> KeyboardInterrupt | None:

@@ -36,28 +36,18 @@ Version = tuple[int, ...]
 
 
 class Choice(NamedTuple):
-    """The chosen library, and the reason.
-
-    ``path``: the library, and ``version``: its version, or None. ``source``: where it is from, or "none".
-    ``rejected``: one line for each library that was passed over.
-    """
+    """The chosen library, and where it is from; ``refused``: why the user's own is not taken, "" if it is."""
 
     path: str | None
     version: Version | None
     source: str
-    rejected: list[str]
+    refused: str
 
     def describe(self) -> str:
         """Return the choice in one sentence."""
         if self.version is None:
-            but = f", but {'; '.join(self.rejected)}" if self.rejected else ""
-            return f"no usable LLVM {OLDEST} or newer was found{but}. {HELP}"
-        return f"LLVM {version_text(self.version)}, {self.source}: {self.path}"
-
-
-def version_text(version: Version) -> str:
-    """Return a version as text, e.g. "19.1"."""
-    return ".".join(map(str, version)) if version[0] else "older than 16"
+            return f"no usable LLVM {OLDEST} or newer was found. {HELP}"
+        return f"LLVM {'.'.join(map(str, self.version))}, {self.source}: {self.path}"
 
 
 def choose(environ: Mapping[str, str], search_path: Iterable[str], system: Iterable[str]) -> Choice:
@@ -68,22 +58,20 @@ def choose(environ: Mapping[str, str], search_path: Iterable[str], system: Itera
     """
     wheel = wheel_library(search_path)
     named = environ.get(VARIABLE, "")
-    candidates = []  # path, and where it is from
+    refused = ""
     if named not in ("", BLOCKED, wheel):
-        candidates.append((named, f"named by {VARIABLE}"))
-    if wheel:
-        candidates.append((wheel, f"from the package {WHEEL}"))
-    paths = {os.path.realpath(path) for path in _matching(system, "libLLVM")} - {os.path.realpath(wheel)}
-    versions = [(version_in_name(path) or (), path) for path in filter(os.path.isfile, paths)]
-    candidates += [(path, "of the system") for version, path in sorted(versions, reverse=True) if version]
-    rejected: list[str] = []
-    for path, source in candidates:
-        found = version_of(path)
-        if found and found[0] >= OLDEST:
-            return Choice(path, found, source, rejected)
-        what = f"is LLVM {version_text(found)}" if found else "cannot be loaded"
-        rejected.append(f"{path}, {source}, {what}")
-    return Choice(None, None, "none", rejected)
+        version = version_of(named)
+        if version and version[0] >= OLDEST:
+            return Choice(named, version, f"named by {VARIABLE}", "")
+        refused = (
+            f"{named}, named by {VARIABLE}, is no file of LLVM {OLDEST} or newer, such as libLLVM.so.19.1"
+        )
+    newest = max(_matching(system, "libLLVM"), key=lambda path: version_of(path) or (), default="")
+    for path, source in ((wheel, f"from the package {WHEEL}"), (newest, "of the system")):
+        version = version_of(path)
+        if version and version[0] >= OLDEST:
+            return Choice(path, version, source, refused)
+    return Choice(None, None, "none", refused)
 
 
 def wheel_library(search_path: Iterable[str]) -> str:
@@ -126,45 +114,15 @@ def _matching(folders: Iterable[str], prefix: str) -> Iterator[str]:
             yield from (os.path.join(folder, name) for name in names if name.startswith(prefix))
 
 
-def version_in_name(path: str) -> Version | None:
-    """Return the version in a file name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1, or None."""
-    name = re.fullmatch(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.so(?:\.(\d+(?:\.\d+)*))?", os.path.basename(path))
-    numbers = name and (name[1] or name[2])
-    return tuple(map(int, numbers.split("."))) if numbers else None
-
-
 def version_of(library: str) -> Version | None:
-    """Return the version of a library, a path or a name for the dynamic linker; None if unusable.
+    """Return the version in the name of a library: (19, 1) of libLLVM.so.19.1, (17,) of libLLVM-17.so.1.
 
-    Where neither the name nor the target of a symbolic link holds it, the library is asked, in a process of
-    its own.
+    Symbolic links are followed. None for a file that is not there, or whose name has no version.
     """
     path = os.path.realpath(library)
-    if os.path.dirname(library):
-        if not os.path.isfile(path):
-            return None
-        if version := version_in_name(path):
-            return version
-    import subprocess
-
-    words = [sys.executable, "-I", "-c", _ASK, library]
-    try:
-        answer = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
-        return tuple(map(int, answer.stdout.split()))
-    except (OSError, ValueError, subprocess.SubprocessError):
-        return None
-
-
-# Prints 0 0 0 for what is older than LLVM 16
-_ASK = """
-import ctypes, sys
-numbers = [ctypes.c_uint(0) for _ in range(3)]
-library = ctypes.CDLL(sys.argv[1])
-library.LLVMContextCreate
-if hasattr(library, "LLVMGetVersion"):
-    library.LLVMGetVersion(*map(ctypes.byref, numbers))
-print(*(number.value for number in numbers))
-"""
+    name = re.fullmatch(r"libLLVM(?:-(\d+(?:\.\d+)*))?\.so(?:\.(\d+(?:\.\d+)*))?", os.path.basename(path))
+    numbers = name and (name[1] or name[2])
+    return tuple(map(int, numbers.split("."))) if numbers and os.path.isfile(path) else None
 
 
 @functools.cache
@@ -179,8 +137,8 @@ def prepare() -> Choice:
     text = None
     if "drjit" in sys.modules and choice.path:
         text = problem(choice)
-    elif choice.rejected and VARIABLE in choice.rejected[0]:
-        text = f"{choice.rejected[0]}; Dr.Jit needs LLVM {OLDEST} or newer. Instead: {choice.describe()}"
+    elif choice.refused:
+        text = f"{choice.refused}. Instead: {choice.describe()}"
     if text:
         warnings.warn(text, MrtWarning, stacklevel=2)
     return choice

@@ -1,15 +1,14 @@
-"""The memory that a render may use, and the cores of this machine, within the limits of control groups."""
+"""The memory that a render may use, and the cores of this machine, within the limits of a container."""
 
 from __future__ import annotations
 
 import contextlib
 import math
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mrt_mitsuba.errors import MrtError, UsageError
+from mrt_mitsuba.errors import UsageError
 
 # For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
 BYTES_PER_CHANNEL = 4
@@ -28,6 +27,8 @@ MAX_WAVEFRONT = 2**23  # rays; more bring no speed, and progress is reported by 
 MIN_WAVEFRONT = 2**16  # rays; with fewer, starting the kernels costs more than running them
 MAX_BAND = 2**22  # pixels of a band of the picture that a filter works on
 MIN_BAND_ROWS = 24  # with fewer, most of the work is done twice
+
+GROUP = Path("/sys/fs/cgroup")  # the control group (version 2) of a container, as it sees it
 
 
 @dataclass
@@ -98,31 +99,17 @@ class Workspace:
             dr.flush_malloc_cache()
 
 
-def memory(root: Path = Path("/")) -> tuple[int, int]:
-    """Return the free bytes, and those of the machine, within the limits of control groups.
-
-    ``root``: where the system's folders ``proc`` and ``sys`` are.
-    """
+def memory(group: Path = GROUP) -> tuple[int, int]:
+    """Return the free bytes, and those of the machine, within the limit of this process's control group."""
     import psutil
 
     state = psutil.virtual_memory()
     free, total = state.available, state.total
-    for group in _control_groups(root):
-        with contextlib.suppress(OSError, ValueError):  # of the root, or "max"
-            limit = int((group / "memory.max").read_text())
-            used = int((group / "memory.current").read_text())
-            free, total = min(free, limit - used), min(total, limit)
+    with contextlib.suppress(OSError, ValueError):  # no such group, or "max"
+        limit = int((group / "memory.max").read_text())
+        used = int((group / "memory.current").read_text())
+        free, total = min(free, limit - used), min(total, limit)
     return max(0, free), total
-
-
-def check_start() -> None:
-    """Raise ``MrtError`` where importing Mitsuba ends the process."""
-    try:
-        os.getcwd()
-    except FileNotFoundError as error:
-        raise MrtError(
-            "the working folder has been deleted, and Mitsuba needs one: change to another"
-        ) from error
 
 
 def _text(count: float) -> str:
@@ -136,24 +123,13 @@ def affinity() -> list[int]:
     return list(range(os.cpu_count() or 1))
 
 
-def usable_cores(root: Path = Path("/")) -> int:
-    """Return the number of cores of this process's affinity, or of its control groups' quota if that is less.
+def usable_cores(group: Path = GROUP) -> int:
+    """Return the number of cores of this process's affinity, or of its control group's quota if that is less.
 
-    A quota of one and a half cores counts as two. ``root``: where the system's ``proc`` and ``sys`` are.
+    A quota of one and a half cores counts as two.
     """
     count = len(affinity())
-    for group in _control_groups(root):
-        with contextlib.suppress(OSError, ValueError):  # of the root, or "max"
-            quota, period = map(int, (group / "cpu.max").read_text().split())
-            count = min(count, math.ceil(quota / period))
+    with contextlib.suppress(OSError, ValueError):  # no such group, or "max"
+        quota, period = map(int, (group / "cpu.max").read_text().split())
+        count = min(count, math.ceil(quota / period))
     return count
-
-
-def _control_groups(root: Path) -> Iterator[Path]:
-    """Yield the folders of this process's control group (version 2) and of those above it."""
-    with contextlib.suppress(OSError):  # not on Linux, or hidden by a container
-        for line in (root / "proc/self/cgroup").read_text().splitlines():
-            number, _, path = line.split(":", 2)
-            group = Path(path.lstrip("/"))
-            for folder in (group, *group.parents) if number == "0" else ():
-                yield root / "sys/fs/cgroup" / folder

@@ -10,12 +10,12 @@ from __future__ import annotations
 import contextlib
 import inspect
 import os
-import stat
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, reduce, wraps
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -27,36 +27,14 @@ from mrt_mitsuba.plugins.whitted.snapshot import updates
 
 Function = Callable[..., Any]
 
-# Files are searched for our plugins up to this size; larger ones are taken to have some
-LARGEST_SEARCHED = 2**26  # bytes
-
 # What an XML file has that names a plugin of ours, or may do so in a way that a search does not see: another
-# file, an escaped letter, a parameter, an encoding of several bytes for a letter
-HINTS = (b"mrt_", b"<include", b"&#", b'type="$', b"type='$", b"\0")
-
-
-class ForkSafeRLock:
-    """A re-entrant lock that is free in a process forked by another thread.
-
-    Taken by ``with render_lock.lock``: an interrupt cannot come between taking it and noting that it must be
-    released, as it can in a method in Python.
-    """
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        if hasattr(os, "register_at_fork"):  # not on Windows
-            os.register_at_fork(after_in_child=self._forked)
-
-    def _forked(self) -> None:
-        if self.lock.acquire(blocking=False):
-            self.lock.release()
-        else:  # the thread that holds it is not in this process
-            self.lock = threading.RLock()
+# file, or a parameter
+HINTS = ("mrt_", "<include", 'type="$', "type='$")
 
 
 #: held while Mitsuba is set up, and while it renders our plugins: there, neither it nor Dr.Jit is safe with
 #: several Python threads
-render_lock = ForkSafeRLock()
+render_lock = threading.RLock()
 
 
 # ----------------------------------------------- The list ----------------------------------------------
@@ -136,20 +114,14 @@ def of_this_package(thing: object) -> bool:
     return type(thing).__module__.startswith("mrt_mitsuba.")
 
 
-def needs_lock(scene: mi.Scene, integrator: mi.Integrator) -> bool:
-    """True if a render runs Python code of ours, and no third-party integrator that may wait for it."""
+def needs_lock(integrator: mi.Integrator) -> bool:
+    """True if a render may run Python code of ours, and no third-party integrator that may wait for it."""
     if of_this_package(integrator):
         return True
     if not plugins.any_loaded() or not isinstance(integrator, mi.Integrator):
         return False
     inside = mi.traverse(integrator).hierarchy  # aov renders with others
-    if not all(plugins.is_known(each) for each in inside if isinstance(each, mi.Integrator)):
-        return False
-    shapes = scene.shapes()
-    materials = [shape.bsdf() for shape in shapes]
-    direct = (*scene.emitters(), *shapes, *materials, *scene.sensors())
-    # A texture, say, in a material of Mitsuba's
-    return any(map(of_this_package, direct)) or any(map(of_this_package, mi.traverse(scene).hierarchy))
+    return all(plugins.is_known(each) for each in inside if isinstance(each, mi.Integrator))
 
 
 @patch(
@@ -161,9 +133,9 @@ def needs_lock(scene: mi.Scene, integrator: mi.Integrator) -> bool:
 def render_under_lock(render: Function, /, *args: object, **given: object) -> object:
     scene = _argument(0, "scene", args, given)
     integrator = _argument(3, "integrator", args, given)
-    if not isinstance(scene, mi.Scene) or not needs_lock(scene, integrator or scene.integrator()):
+    if not isinstance(scene, mi.Scene) or not needs_lock(integrator or scene.integrator()):
         return render(*args, **given)
-    with render_lock.lock:
+    with render_lock:
         try:
             return render(*args, **given)
         except RuntimeError as error:
@@ -178,7 +150,7 @@ def render_under_lock(render: Function, /, *args: object, **given: object) -> ob
     why="a change in the midst of a render ends the process",
 )
 def set_under_lock(setitem: Function, /, *args: object, **given: object) -> object:
-    with render_lock.lock:
+    with render_lock:
         return setitem(*args, **given)
 
 
@@ -190,7 +162,7 @@ def set_under_lock(setitem: Function, /, *args: object, **given: object) -> obje
 def update_under_lock(
     update: Function, /, *args: object, **given: object
 ) -> list[tuple[mi.Object, set[str]]]:
-    with render_lock.lock:
+    with render_lock:
         updated = update(*args, **given)
         parameters = _argument(0, "self", args, given)
         changed = dict(updated) if plugins.any_loaded() else {}
@@ -220,20 +192,14 @@ def dict_is_ours(scene: object) -> bool:
 
 def text_is_ours(text: object) -> bool:
     """True if XML may have a plugin of ours."""
-    return isinstance(text, str) and any(hint.decode() in text for hint in HINTS)
+    return isinstance(text, str) and any(hint in text for hint in HINTS)
 
 
 def file_is_ours(path: Any) -> bool:
     """True if an XML file may have a plugin of ours."""
-    # Mitsuba itself reports what cannot be read. What is no file, such as a pipe, can be read only once
-    with contextlib.suppress(OSError, ValueError, TypeError):
+    with contextlib.suppress(OSError, ValueError, TypeError):  # Mitsuba itself reports what cannot be read
         name = str(mi.file_resolver().resolve(os.fspath(path)))
-        state = os.stat(name)
-        if not stat.S_ISREG(state.st_mode) or state.st_size > LARGEST_SEARCHED:
-            return True
-        with open(name, "rb") as file:
-            text = file.read(state.st_size)
-        return any(hint in text for hint in HINTS)
+        return os.path.isfile(name) and text_is_ours(Path(name).read_text(errors="ignore"))  # no device
     return False
 
 

@@ -45,7 +45,7 @@ def use(variant: str | None = None) -> str:
     if _used and variant in (None, _used) and mi.variant() == _used:
         return _used
     quickly = mitsuba_changes.rewriting_later() if _guard else contextlib.nullcontext()
-    with render_lock.lock, defer_signals(), quickly:
+    with render_lock, defer_signals(), quickly:
         if variant is None:
             variant = mi.variant() or default_variant()
         elif variant not in mi.variants():

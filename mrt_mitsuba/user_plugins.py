@@ -1,8 +1,9 @@
 """Imports the user's own Mitsuba plugins: ``plugins=FILE.py`` or the name of an installed module.
 
 A plugin's class derives from a class of the current Mitsuba variant, so each module is executed once for
-each variant in which it is used, and its function ``register()``, if it has one, is called each time. The
-working folder is not searched: only what is named is imported from it.
+each variant in which it is used, and its function ``register()``, if it has one, is called each time. A file
+that changes is executed again in a new process only. The working folder is not searched: only what is named
+is imported from it.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from typing import Any
 
 from mrt_mitsuba.errors import MrtError, UsageError, one_line
 
-_named: dict[str, str] = {}  # digests of the modules to load in every variant, by name or absolute path
-_executed: set[tuple[str, str, str]] = set()  # variant, name and digest of what has been executed
+_named: list[str] = []  # modules to load in every variant, by name or absolute path
+_executed: set[tuple[str, str]] = set()  # variant and name of what has been executed
 _watching = False
 
 
@@ -51,13 +52,11 @@ def plugin_names(plugins: Any) -> list[str]:
 def load(plugins: Any) -> None:
     """Import plugins for the current variant, if one is set, and for every variant switched to later.
 
-    ``plugins``: a path or the name of a module, or several. What has been imported is imported again only
-    after its file has changed. Raises ``UsageError`` where there is no such file or module, and ``MrtError``
-    for one that fails.
+    ``plugins``: a path or the name of a module, or several. Raises ``UsageError`` where there is no such file
+    or module, and ``MrtError`` for one that fails.
     """
     global _watching
-    for name in plugin_names(plugins):
-        _named[name] = digest(name)
+    _named.extend(name for name in plugin_names(plugins) if name not in _named)
     import mitsuba as mi
 
     if not _watching:
@@ -87,8 +86,8 @@ def _source(path: str) -> Path | None:
 
 
 def _load_all(variant: str) -> None:
-    for name, content in _named.items():
-        if (variant, name, content) in _executed:
+    for name in _named:
+        if (variant, name) in _executed:
             continue
         try:
             with _without_working_folder():
@@ -96,16 +95,16 @@ def _load_all(variant: str) -> None:
                 if callable(register := getattr(module, "register", None)):
                     register()
         except (Exception, SystemExit) as error:
-            _named.pop(name)
+            _named.remove(name)
             raise _explained(name, error) from error
-        _executed.add((variant, name, content))
+        _executed.add((variant, name))
 
 
 def _execute(name: str) -> ModuleType:
     """Execute a module, anew if it has been executed before."""
     source = _source(name) if os.sep in name else None
     if source is None:
-        if any(name == known for _, known, _ in _executed):
+        if any(name == known for _, known in _executed):
             _forget(name)
         return importlib.import_module(name)
     title = source.parent.name if source.name == "__init__.py" else source.stem

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 from mrt_mitsuba import __version__
 from mrt_mitsuba.errors import MrtError
-from mrt_mitsuba.machine import check_start
 from mrt_mitsuba.rendering.progress import TerminalProgress
 
 if TYPE_CHECKING:
@@ -63,7 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *more, **_: _say(f"warning: {message}")
         try:
-            check_start()
             return int(not run_studies(names, options.out, quick=options.quick, ablate=options.ablate))
         except MrtError as error:
             _say(error)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import errno
 import os
 import signal
 import sys
@@ -19,8 +18,6 @@ from mrt_mitsuba.errors import MrtError, UsageError, escaped, needs_extra, one_l
 from mrt_mitsuba.interrupts import interrupt_behind, leave_now
 
 INTERRUPTED = 128 + signal.SIGINT
-# What printing fails with where nobody reads, or the disk is full; pictures have errors of their own
-UNPRINTED = (errno.EPIPE, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 # An environment variable; set to anything, unexpected errors show where they came from
 TRACEBACK = "MRT_TRACEBACK"
 
@@ -44,10 +41,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Without arguments, those of the process are taken, and a picture or an interrupt ends it at once.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    # A file that is opened later must not get the number of a stream that the caller closed
-    while (lowest := os.open(os.devnull, os.O_RDWR)) <= 2:
-        setattr(sys, ("stdin", "stdout", "stderr")[lowest], os.fdopen(lowest, "w" if lowest else "r"))
-    os.close(lowest)
     printed: Any = PrintableStream(sys.stdout)
     with warnings.catch_warnings(), contextlib.redirect_stdout(printed):
         warnings.showwarning = lambda message, *place, **more: print(
@@ -76,14 +69,12 @@ def _guarded(words: list[str]) -> tuple[int, str]:
         return INTERRUPTED, "interrupted"
     except MemoryError:
         return 1, "out of memory: choose a smaller width, height or aa"
+    except BrokenPipeError:  # nobody reads any more, as after ``| head``
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains at exit
+        return 1, ""
     except Exception as error:
         if interrupt_behind(error):
             return INTERRUPTED, "interrupted"
-        if isinstance(error, OSError) and error.errno in UNPRINTED and error.filename is None:
-            # or Python complains once more at exit
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            gone = isinstance(error, BrokenPipeError)  # who would have read it
-            return 1, "" if gone else f"cannot print: {error.strerror}; send the output elsewhere"
         if os.environ.get(TRACEBACK):
             raise
         return 1, f"{type(error).__name__}: {error} (set {TRACEBACK}=1 to see where)"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -17,13 +16,6 @@ from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.model import MODEL_OPTIONS
 from mrt_mitsuba.scene.report import NUMBERS
 
-# What ``log`` shows, from the fewest records to the most, as Python, Mitsuba and Dr.Jit call them
-LEVELS = {
-    "error": (logging.ERROR, "Error", "Error"),
-    "warn": (logging.WARNING, "Warn", "Warn"),
-    "info": (logging.INFO, "Info", "Warn"),
-    "debug": (logging.DEBUG, "Debug", "Info"),  # with every kernel that is launched
-}
 FORM = "mrt FILENAME [SCENE] [name=value ...]"
 ABOUT = "Renders a scene and writes FILENAME.png and FILENAME.exr; FILENAME has no extension."
 SCENES = [str(number) for number in NUMBERS]
@@ -55,7 +47,6 @@ class Options(RenderSettings):
     compression: str = option("zip", COMPRESSION, "compression of the EXR, without loss")
     plan: str = option("hide", choice("show", "hide"), "print what will run and what is left out, and why")
     quiet: bool = option(False, SWITCH, "print errors only", "0")
-    log: str = option("warn", choice(*LEVELS), "what to print: warnings; times; every kernel")
 
     def render_arguments(self) -> dict[str, Any]:
         """Return the options that say how to render, without those about files and messages."""

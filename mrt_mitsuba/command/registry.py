@@ -9,13 +9,11 @@ from typing import NamedTuple
 
 from mrt_mitsuba.command.options import add_options, add_scene, read_scene
 from mrt_mitsuba.command.parser import Parser
-from mrt_mitsuba.machine import check_start
 from mrt_mitsuba.scene.model import MODEL_OPTIONS
 
 TOOLS = "mrt_mitsuba.command.tools"
 CHECKS = "mrt_mitsuba.validation.commands"
 HELP = {"-h", "--help"}
-WITHOUT_MITSUBA = ("help", "scenes", "info")
 REQUIRED = ("xml", "cases")  # options of sub-commands
 AT_LEAST = ("psnr", "p_value")  # limits that a measure must reach; it must not exceed the others
 LIMITS = ("mae", "rmse", "rel_mse", "display", "psnr", "largest", "flip", "p_value")
@@ -137,8 +135,6 @@ def run(name: str, words: Sequence[str]) -> int:
         sys.stdout.write(parser.format_help())
         return 0
     values = read_scene(parser, words)
-    if name not in WITHOUT_MITSUBA:
-        check_start()
     if "scene" in values:
         import_plugins(values.pop("plugins", ()))
     elif "scene" in command.options:

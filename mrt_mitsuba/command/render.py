@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import gc
-import logging
 import os
 import sys
 import time
 import warnings
 
-from mrt_mitsuba.command.options import LEVELS, Options
+from mrt_mitsuba.command.options import Options
 from mrt_mitsuba.command.registry import import_plugins
 from mrt_mitsuba.errors import MrtWarning, printable
 from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.interrupts import defer_signals
-from mrt_mitsuba.machine import check_start
 from mrt_mitsuba.options import is_obj
 from mrt_mitsuba.rendering.settings import AA, AAMODE, NOISE
 from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
@@ -22,7 +20,6 @@ from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
 
 def run(options: Options) -> int:
     """Render a scene and write its picture; return the exit code."""
-    check_start()
     for path in options.outputs():
         check_target(path, options.inputs())
     # A tenth of the start is a search for garbage among what is loaded to stay, and threads for NumPy's
@@ -46,8 +43,6 @@ def run(options: Options) -> int:
     if spared:
         gc.freeze()
         gc.enable()
-    if options.log != "warn":
-        show_log(options.log)
     progress = Progress() if options.quiet else TerminalProgress(show_plan=options.plan == "show")
     start = time.perf_counter()
     result = render(options.scene, progress=progress, **options.render_arguments())
@@ -63,20 +58,6 @@ def run(options: Options) -> int:
         print(f"Wrote {printable(' and '.join(options.outputs()))}")
         print(f"Render time: {seconds:.6f}s")
     return 0
-
-
-def show_log(level: str) -> None:
-    """Show records from ``level`` on, of this package, of Mitsuba (on standard output) and of Dr.Jit."""
-    import drjit as dr
-    import mitsuba as mi
-
-    ours, mitsubas, drjits = LEVELS[level]
-    logging.basicConfig(format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    logging.getLogger("mrt_mitsuba").setLevel(ours)
-    mi.set_log_level(getattr(mi.LogLevel, mitsubas))
-    dr.set_log_level(getattr(dr.LogLevel, drjits))
-    if level == "error":
-        warnings.simplefilter("ignore", MrtWarning)
 
 
 def banner(options: Options) -> str:

@@ -57,7 +57,7 @@ def doctor() -> int:
     for package in ("mitsuba", "drjit", "numpy", "OpenEXR", "pillow", llvm.WHEEL):
         print(f"  {package:<20}{installed.get(package.lower(), 'not installed')}")
     choice = llvm.prepare()
-    print("\n  passed over: ".join([choice.describe(), *choice.rejected]))
+    print(choice.describe())
     start = time.perf_counter()
     try:
         import mitsuba as mi

@@ -1,30 +1,23 @@
 """Replacing files: all those of one result or none, and never one that the result was made from.
 
 New files are written next to the old ones under temporary names. Once all are complete and on the disk, they
-take the places of the old; if anything goes wrong before, they disappear. What a killed process left
-is removed by the next one that writes to the folder: a lock says whether its writer still lives.
+take the places of the old; if anything goes wrong before, they disappear.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
 import os
 import stat
-import time
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import IO
 
 from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.options import StrPath
 
-log = logging.getLogger(__name__)
 
-_TEMPORARY = ".mrt-{}.tmp"
-_OLD = 10.0  # seconds after which a file that nobody has locked was left over
-_tidied: set[str] = set()  # folders
+TEMPORARY = ".mrt-{}.tmp"
 
 
 def check_target(path: StrPath, inputs: Iterable[StrPath] = ()) -> None:
@@ -62,8 +55,6 @@ def replacing(*paths: StrPath, inputs: Iterable[StrPath] = ()) -> Iterator[list[
             with defer_signals():  # an interrupt in between is raised afterwards
                 for file, target in zip(files, targets, strict=True):
                     os.replace(file.name, target)
-    for target in targets:
-        log.info("wrote %s", target)
 
 
 @contextlib.contextmanager
@@ -91,8 +82,6 @@ def _target(path: StrPath, inputs: Iterable[StrPath]) -> str:
         old = os.lstat(target)
     except FileNotFoundError:
         return target
-    around = os.stat(folder)
-    sticky = around.st_mode & stat.S_ISVTX
     problem = ""
     if stat.S_ISLNK(old.st_mode):
         problem = "its symbolic links lead in a circle"
@@ -105,8 +94,6 @@ def _target(path: StrPath, inputs: Iterable[StrPath]) -> str:
     # The superuser may write to any file; its owner's "read-only" is respected all the same
     elif not old.st_mode & 0o222 or not os.access(target, os.W_OK):
         problem = "the file is read-only; remove it or choose another name"
-    elif sticky and os.geteuid() not in (0, old.st_uid, around.st_uid):
-        problem = "the file is another user's, and only its owner may replace it here; choose another name"
     if problem:
         raise OutputError(f"cannot write {name}: {problem}")
     return target
@@ -114,22 +101,11 @@ def _target(path: StrPath, inputs: Iterable[StrPath]) -> str:
 
 @contextlib.contextmanager
 def _temporary(folder: str) -> Iterator[IO[bytes]]:
-    """Give a new file in a folder, locked, with the rights of the user's umask; remove it at the end."""
-    if folder not in _tidied:
-        _tidied.add(folder)
-        for left in Path(folder).glob(_TEMPORARY.format(16 * "[0-9a-f]")):  # of processes that were killed
-            with contextlib.suppress(OSError):
-                state = left.lstat()
-                if stat.S_ISREG(state.st_mode) and time.time() - state.st_mtime > _OLD:
-                    with left.open("rb") as file:
-                        _lock(file)  # raises while its writer lives
-                        left.unlink()
-    name = os.path.join(folder, _TEMPORARY.format(os.urandom(8).hex()))
+    """Give a new file in a folder, with the rights of the user's umask; remove it at the end."""
+    name = os.path.join(folder, TEMPORARY.format(os.urandom(8).hex()))
     try:
         new = open(name, "x+b")  # noqa: SIM115 - closing it may fail
         try:
-            with contextlib.suppress(OSError):  # not every file system can
-                _lock(new)
             yield new
         finally:
             with contextlib.suppress(OSError):  # a full disk has no room for the rest
@@ -137,11 +113,3 @@ def _temporary(folder: str) -> Iterator[IO[bytes]]:
     finally:
         with contextlib.suppress(OSError):
             os.unlink(name)
-
-
-def _lock(file: IO[bytes]) -> None:
-    """Lock a file; raises ``OSError`` if another process has it, or the file system has no locks."""
-    if os.name == "posix":
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

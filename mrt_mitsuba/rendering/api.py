@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -35,7 +34,6 @@ from mrt_mitsuba.rendering.settings import Convention, Lattice, RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import Source, open_scene, sized
 
-log = logging.getLogger(__name__)
 Image = NDArray[np.float32]
 LONGEST_ARRAY = 64  # entries of an array that the header of an EXR holds; larger ones are named only
 
@@ -204,7 +202,7 @@ def refuse_freezing() -> None:
 def session(settings: RenderSettings) -> Iterator[Job]:
     """Let one render run alone, in the variant that the settings name, and measure what it costs."""
     refuse_freezing()
-    with runtime.render_lock.lock, defer_signals(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    with runtime.render_lock, defer_signals(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         budget = Budget.of(settings.memory)
         job = Job(settings.progress or default_progress(), budget, settings.on_round)
@@ -244,20 +242,15 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
             budget=job.budget,
         )
         job.start(plan, workspace)
-        timings = job.timings
-        log.info("scene %s loaded in %.3f s for %s", source.name, timings.load, plan.variant)
         picture = _frames(shader, plan, job)
         layers = picture.layers
         error = picture.error
         job.collect()
-        job.progress.finish()
-        text = "%d kernels: compiled in %.3f s, ran for %.3f s"
-        log.info(text, job.launches, timings.compile, timings.kernels)
         return Result(
             image=layers["image"],
             layers=_channels(layers, plan),
             plan=plan if error is None else plan.resolved(error.target, picture.left_out),
-            timings=timings,
+            timings=job.timings,
             rays=job.rays,
             kernel_launches=job.launches,
             options=plan.options,

@@ -447,7 +447,7 @@ def _samples(settings: RenderSettings, first: int = 0) -> SamplePattern:
         repeats *= max(_strata(settings), 1)  # each ray has a time of its own
         return SamplePattern(FILM, aa, first, aa**2 - first, repeats)
     pattern = _centre(settings)
-    return replace(pattern, lattice=settings.lattice, aa=aa, first=first, count=aa**2 - first)
+    return replace(pattern, lattice=str(settings.lattice), aa=aa, first=first, count=aa**2 - first)
 
 
 def _centre(settings: RenderSettings) -> SamplePattern:

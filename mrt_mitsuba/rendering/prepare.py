@@ -37,7 +37,7 @@ class Prepared:
     def __init__(self, scene: object, settings: RenderSettings) -> None:
         self._scene = scene
         self._settings = settings
-        with runtime.render_lock.lock, defer_signals():
+        with runtime.render_lock, defer_signals():
             self._render(self._settings.seed)
             self._film_window = _window(self._source.sensor.film())
             self.params = mi.traverse(self._source.scene)
@@ -46,7 +46,7 @@ class Prepared:
     def __call__(self, seed: int = 0) -> Result:
         """Render the scene as it is now; ``seed`` is of all random numbers."""
         refuse_freezing()
-        with runtime.render_lock.lock, defer_signals(), runtime.within(self._made.plan.variant):
+        with runtime.render_lock, defer_signals(), runtime.within(self._made.plan.variant):
             self.params.update()
             self._resize()
             if self._launch is None:

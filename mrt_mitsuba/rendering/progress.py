@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
-import logging
 import sys
 import time
 import warnings
@@ -18,8 +16,6 @@ from mrt_mitsuba.machine import Budget, Workspace
 
 if TYPE_CHECKING:
     from mrt_mitsuba.adaptive.error import RoundPicture
-
-log = logging.getLogger(__name__)
 
 SECONDS = 0.1  # between two looks at what kernels took
 
@@ -36,14 +32,6 @@ class Progress:
 
     def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
         """Receive the records of the kernels that Dr.Jit ran since the last call."""
-
-    shows_rounds = False  #: whether ``round`` wants the picture after each round of rays
-
-    def round(self, picture: RoundPicture) -> None:
-        """Receive the picture after a round of rays."""
-
-    def finish(self) -> None:
-        """Receive the end of the render."""
 
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
@@ -101,55 +89,9 @@ class TerminalProgress(Progress):
             yield bar.update
 
 
-class NotebookProgress(TerminalProgress):
-    """Bars in a notebook and, while rays go in rounds, one display of the picture as it gets better."""
-
-    shows_rounds = True
-
-    _display: Any = None  # IPython's handle of the picture
-    _picture = ""  # after the last round, as HTML
-    _caption = ""
-
-    def round(self, picture: RoundPicture) -> None:
-        from mrt_mitsuba.files.images import png
-
-        encoded = base64.b64encode(png(picture.image)).decode()
-        target = "" if picture.target is None else f" (target {picture.target:.2g})"
-        caption = f"error {picture.rmse:.2g}{target}, {picture.spp:.0f} spp, {picture.seconds:.1f} s"
-        self._picture = f'<img src="data:image/png;base64,{encoded}" alt="{caption}">'
-        self._caption = caption
-        self._show(caption)
-
-    def finish(self) -> None:
-        """Leave a line: the result shows the picture itself."""
-        if self._display is not None:
-            self._picture = ""
-            self._show(self._caption)
-
-    @contextlib.contextmanager
-    def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
-        if title == ROUNDS and self._picture:
-            self._show(message)  # in place of a bar
-            yield _ignore
-            return
-        with super().stage(title, total, message) as advance:
-            yield advance
-
-    def _show(self, caption: str) -> None:
-        from IPython.display import HTML, display
-
-        shown = HTML(f"{self._picture}<br>{caption}" if self._picture else caption)
-        if self._display is None:
-            self._display = display(shown, display_id=True)
-        else:
-            self._display.update(shown)
-
-
 def default_progress() -> Progress:
     """Return the progress of a render that is given none: bars in notebooks and on terminals."""
-    if "ipykernel" in sys.modules:
-        return NotebookProgress()
-    if sys.stderr is not None and sys.stderr.isatty():
+    if "ipykernel" in sys.modules or (sys.stderr is not None and sys.stderr.isatty()):
         return TerminalProgress(messages=False, delay=0.5)
     return Progress()
 
@@ -184,7 +126,7 @@ class Job:
     ) -> None:
         self.progress = progress
         self.budget = budget  #: bytes that it may use
-        self._on_round = on_round
+        self.on_round = on_round  #: called after each round; stops the render by returning False
         self.timings = Timings()  #: up to now
         self.rays = Counter(primary=0)  #: traced, by kind
         self.launches = 0  #: of kernels
@@ -196,19 +138,6 @@ class Job:
         self.workspace = workspace
         self.progress.plan(plan)
         self.timings.load = time.perf_counter() - self._began
-
-    @property
-    def on_round(self) -> Callable[[RoundPicture], object] | None:
-        """The function to call with the picture after each round of rays, which stops the render by returning
-        False; None without one."""
-        if not self.progress.shows_rounds:
-            return self._on_round
-
-        def show(picture: RoundPicture) -> object:
-            self.progress.round(picture)
-            return self._on_round(picture) if self._on_round else None
-
-        return show
 
     def collect(self) -> None:
         """Add up what Dr.Jit recorded since the last call. Records hold the kernels' text: many take room."""
@@ -241,4 +170,3 @@ class Job:
             self.collect()
         seconds = time.perf_counter() - start
         self.timings.passes[name] = self.timings.passes.get(name, 0.0) + seconds
-        log.info("%s: %d pixels in %.3f s", name, total, seconds)

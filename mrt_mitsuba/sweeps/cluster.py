@@ -9,7 +9,6 @@ import asyncio
 import json
 import logging
 import os
-import subprocess
 import sys
 import tempfile
 from collections import Counter, deque
@@ -41,9 +40,7 @@ class ClusterError(MrtError):
 
 
 @contextmanager
-def connected(
-    cluster: Any, jobs: int, workers: int | None, dashboard: int | None, variant: str
-) -> Iterator[Client]:
+def connected(cluster: Any, jobs: int, workers: int | None) -> Iterator[Client]:
     """Give a client whose workers are there; see ``sweep``.
 
     Workers of this machine, at most as many as jobs, end with the block. Raises ``ClusterError`` if no
@@ -59,12 +56,11 @@ def connected(
         patience = CONNECTING
         security = None
         if cluster is None:
-            devices = gpus() if variant.startswith("cuda") else []
-            count = workers or min(len(devices) or usable_cores(), jobs)
+            count = workers or min(usable_cores(), jobs)
             patience = STARTING
             security = Security.temporary()
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="mrt-sweep-"))
-            cluster = stack.enter_context(_local(count, dashboard, devices, security, folder))
+            cluster = stack.enter_context(_local(count, security, folder))
         try:
             client = cluster
             if not isinstance(cluster, Client):
@@ -111,7 +107,7 @@ class LocalWorker(SubprocessWorker):
         self.process = await asyncio.create_subprocess_exec(*command, cwd=self.folder, env=environ)
 
 
-def _local(count: int, dashboard: int | None, devices: list[str], security: Any, folder: str) -> SpecCluster:
+def _local(count: int, security: Any, folder: str) -> SpecCluster:
     """Return a scheduler in this process, and workers in processes of their own with one thread for jobs.
 
     All listen on the loopback only, and talk TLS with a key made for this sweep, as other users of this
@@ -132,30 +128,17 @@ def _local(count: int, dashboard: int | None, devices: list[str], security: Any,
     tls |= {"WORKER__KEY": security.tls_worker_key, "WORKER__CERT": security.tls_worker_cert}
     environ = {f"DASK_DISTRIBUTED__COMM__TLS__{name}": value for name, value in tls.items()}
     environ["DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION"] = "True"
-    environs = [environ | {"CUDA_VISIBLE_DEVICES": device} for device in devices] or [environ]
-    workers = {}
-    for number in range(count):
-        own = {"worker_kwargs": options, "folder": folder, "environ": environs[number % len(environs)]}
-        workers[number] = {"cls": LocalWorker, "options": own}
+    own = {"worker_kwargs": options, "folder": folder, "environ": environ}
+    workers = {number: {"cls": LocalWorker, "options": own} for number in range(count)}
     scheduler = {
         "allowed_failures": 0,  # ``outcomes`` submits a job again that lost its worker
         "host": LOOPBACK,
         "protocol": "tls",
         "security": security,
-        "dashboard": dashboard is not None,
-        "dashboard_address": f"{LOOPBACK}:{dashboard or 0}",
+        "dashboard": False,
+        "dashboard_address": f"{LOOPBACK}:0",
     }
     return SpecCluster(workers=workers, scheduler={"cls": Scheduler, "options": scheduler}, security=security)
-
-
-def gpus() -> list[str]:
-    """Return the GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
-    named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if named is None:
-        with suppress(OSError, subprocess.SubprocessError):
-            listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, timeout=30, check=True)
-            return list(map(str, range(listed.stdout.count(b"\n"))))
-    return [name for name in (named or "").split(",") if name]
 
 
 def inspect(client: Client, folder: str, here: str) -> dict[str, int]:

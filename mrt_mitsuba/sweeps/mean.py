@@ -53,7 +53,7 @@ def mean_of_seeds(folder: str, job: Job, rows: Sequence[Facts]) -> Result:
     layers.pop("variance", None)
     layers["error.Y"] = np.sqrt(variance.mean(-1)).astype(np.float32)
     settings = RenderSettings.of(**job.arguments)
-    with runtime.render_lock.lock, runtime.within(settings.variant or runtime.use()):
+    with runtime.render_lock, runtime.within(settings.variant or runtime.use()):
         source = open_with(job.scene, settings, Budget.of(None))
         with sized(source):
             plan = make_plan(source, Shader(source, settings.motion), settings)

@@ -28,9 +28,7 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
     cluster: Any = None,
     retries: int = 2,
     resume: bool = True,
-    png: bool = False,
     plugins: Any = (),
-    dashboard: int | None = None,
     progress: Progress | None = None,
     **options: object,
 ) -> Table:
@@ -45,14 +43,13 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
         grid: a list of values for each key. Keys with a dot are those of ``mi.traverse``; "scene" stands for
             scenes, any other for an argument of ``render``.
         zipped: take the first values of all axes, then the second: frames, whose files are numbered.
-        workers: processes on this machine; by default one for each core, or GPU in a ``cuda`` variant.
+        workers: processes on this machine; by default one for each core. For a ``cuda`` variant, say how
+            many the GPU has room for.
         cluster: address of a Dask scheduler, or a ``dask.distributed.Client``; None for this machine.
         retries: how often a job may lose its worker or fail by accident.
         resume: keep the pictures that are whole and were made with the same settings and versions.
-        png: write a PNG of each picture, too.
         plugins: Python files or names of modules with plugins of your own, imported here and by each
             worker.
-        dashboard: port of Dask's pages about the workers of this machine, which need Bokeh.
         progress: receives how far it is; by default shown on a terminal and in notebooks.
         options: arguments of ``render`` that all jobs share.
 
@@ -64,13 +61,9 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
     """
     with needs_extra("cluster"):
         from mrt_mitsuba.sweeps.cluster import connected, inspect, outcomes
-    for name, number, least in (
-        ("workers", workers, 1),
-        ("retries", retries, 0),
-        ("dashboard", dashboard, 0),
-    ):
-        if number is not None:
-            check(name, integer(least, 65535), number)
+    check("retries", integer(0, 65535), retries)
+    if workers is not None:
+        check("workers", integer(1, 65535), workers)
     if workers is not None and cluster is not None:
         raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
     current = getattr(sys.modules.get("mitsuba"), "variant", str)()
@@ -90,7 +83,7 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
         user_plugins.load(modules)
         table = Table(folder, named)
         planned = jobs(scene, named, dict(options), [user_plugins.digest(name) for name in modules])
-        whole = {job.name for job in planned if is_fresh(job, folder, job.file in table.earlier, png)}
+        whole = {job.name for job in planned if is_fresh(job, folder, job.file in table.earlier)}
         missing = [job for job in planned if not (job.name in whole and resume)]
         check_parameters(missing)
         versions = describe(folder)["versions"]
@@ -102,11 +95,9 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
         with ExitStack() as stack:
             advance = stack.enter_context(shown.stage("Sweep", len(missing)))
             if missing:
-                variant = options.get("variant") or ""
-                client = stack.enter_context(connected(cluster, len(missing), workers, dashboard, variant))
+                client = stack.enter_context(connected(cluster, len(missing), workers))
                 setting = {
                     "folder": folder,
-                    "png": png,
                     "versions": versions,
                     "sharing": inspect(client, folder, versions),
                     "plugins": modules,

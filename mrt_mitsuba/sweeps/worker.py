@@ -8,13 +8,10 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 
-from PIL import Image
-from PIL.PngImagePlugin import PngInfo
-
 from mrt_mitsuba import runtime, user_plugins
 from mrt_mitsuba.errors import MrtError
-from mrt_mitsuba.files.images import save, to_8bit
-from mrt_mitsuba.files.replacing import check_target, replacing
+from mrt_mitsuba.files.images import save
+from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.machine import affinity, memory, usable_cores
 from mrt_mitsuba.options import SMALLEST_MEMORY
 from mrt_mitsuba.rendering.progress import Progress
@@ -37,7 +34,6 @@ def describe(folder: str) -> Facts:
 def render_job(
     data: bytes,
     folder: str,
-    png: bool,
     versions: str,
     sharing: Mapping[str, int],
     plugins: Sequence[str],
@@ -54,7 +50,7 @@ def render_job(
     worker = get_worker()
     facts: Facts = {"worker": worker.address}
     try:
-        with runtime.render_lock.lock:
+        with runtime.render_lock:
             here = describe(folder)
             if here["versions"] != versions:
                 raise MrtError(f"the worker has {here['versions']}; the sweep began with {versions}")
@@ -62,13 +58,13 @@ def render_job(
                 os.chdir(working_folder)
             user_plugins.load(plugins)
             threads = max(2, usable_cores() // sharing.get(here["cores"], 1))
-            facts |= _render(decode(data), folder, png, threads, worker.memory_manager.memory_limit)
+            facts |= _render(decode(data), folder, threads, worker.memory_manager.memory_limit)
     except MrtError as error:
         facts["error"] = str(error)
     return facts
 
 
-def _render(job: Job, folder: str, png: bool, threads: int, limit: int | None) -> Facts:
+def _render(job: Job, folder: str, threads: int, limit: int | None) -> Facts:
     start = time.perf_counter()
     import drjit as dr
 
@@ -87,11 +83,6 @@ def _render(job: Job, folder: str, png: bool, threads: int, limit: int | None) -
     path = os.path.join(folder, job.file)
     check_target(path, result.inputs)  # a scene may read pictures of earlier sweeps
     save(path, result.image, layers=result.layers, header=header)
-    if png:
-        mark = PngInfo()
-        mark.add_text(MADE_WITH, job.made_with)
-        with replacing(os.path.join(folder, f"{job.name}.png"), inputs=result.inputs) as (file,):
-            Image.fromarray(to_8bit(result.image)).save(file, format="PNG", pnginfo=mark)
     return {
         "file": job.file,
         "seconds": time.perf_counter() - start,

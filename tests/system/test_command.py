@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
@@ -37,24 +35,8 @@ def test_picture_and_its_two_files_of_the_same_bytes_each_time(mrt_command, tmp_
         assert_array_equal(np.asarray(png), np.clip(np.trunc(exr.image * 255), 0, 255))
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
-@pytest.mark.parametrize(
-    ("words", "code", "errors", "left"),
-    [
-        ("help >/dev/full", 1, "mrt: cannot print: No space left on device; send the output elsewhere\n", []),
-        ("out 0 width=8 height=6 >/dev/full", 1, "mrt: cannot print: No space left", []),
-        ("help | head -1", 0, "", []),  # a reader that goes away
-        # files opened later would get the numbers of output and error, and what is printed
-        ("out 0 width=8 height=6 aa=1 format=exr >&- 2>&-", 0, "", ["out.exr"]),
-    ],
-)
-def test_output_that_cannot_be_printed(run_command, tmp_path, words, code, errors, left):
-    done = run_command("sh", "-c", f"{MRT} {words}", code=code)
-    assert done.stderr.startswith(errors)
-    assert done.stderr.count("\n") == bool(errors)
-    assert [path.name for path in tmp_path.iterdir()] == left
-    if left:
-        assert read_exr(tmp_path / "out.exr").image.shape == (6, 8, 3)
+def test_a_reader_that_goes_away_is_no_error(run_command):
+    assert not run_command("sh", "-c", f"{MRT} help | head -1").stderr
 
 
 def test_doctor(mrt_command):
@@ -91,25 +73,3 @@ def test_info_and_plugins_of_a_file(mrt_command, run_command, tmp_path):
     assert "\\x9b31m" in done.stdout
     done = mrt_command("check", "a.xml", "plugins=./mine.py", "quick=1", code=None)
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("mrt ex", ["export"]),
-        ("mrt out aam", ["aamode="]),
-        ("mrt out 3 aamode=s", ["aamode=sobel"]),
-        ("mrt diff a b fl", ["flip="]),
-        ("mrt sweep out wor", ["workers="]),
-    ],
-)
-def test_tab_completes_words(mrt_command, tmp_path, line, words):
-    variables = {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE": "1"}
-    variables |= {
-        "_ARGCOMPLETE_STDOUT_FILENAME": "found",
-        "_ARGCOMPLETE_IFS": "\n",
-        "_ARGCOMPLETE_SHELL": "fish",
-    }
-    mrt_command(**variables)
-    found = (tmp_path / "found").read_text().splitlines()
-    assert [each.split("\t")[0].strip() for each in found] == words

@@ -2,7 +2,6 @@
 
 import io
 import sys
-import types
 from contextlib import nullcontext
 
 import drjit as dr
@@ -16,7 +15,7 @@ import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.rendering import exposing
 from mrt_mitsuba.rendering.plan import Rounds
-from mrt_mitsuba.rendering.progress import NotebookProgress, Progress, default_progress
+from mrt_mitsuba.rendering.progress import Progress, default_progress
 
 SIZE = 16
 
@@ -104,34 +103,6 @@ def test_a_plan_holds_what_the_integrator_states_and_the_caller_asks(stated, opt
     assert goal.max_spp == most
     assert (goal.target and goal.target.plain) == target
     assert result.options.get("target") == target
-
-
-def test_a_notebook_shows_one_picture_that_is_updated(monkeypatch):
-    shown = []
-
-    class Handle:
-        def update(self, html):
-            shown.append(html)
-
-    def display(html, display_id):
-        assert display_id
-        shown.append(html)
-        return Handle()
-
-    fake = types.ModuleType("IPython.display")
-    fake.HTML = str
-    fake.display = display
-    monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
-    monkeypatch.setitem(sys.modules, "IPython.display", fake)
-    monkeypatch.setitem(sys.modules, "ipykernel", types.ModuleType("ipykernel"))
-    progress = default_progress()
-    assert isinstance(progress, NotebookProgress)
-    progress.bar_file = io.StringIO()
-    result = mrt.render(box(), integrator="path", spp=64, aamode="noise", progress=progress)
-    assert shown.pop().startswith(f"error {result.rounds[-1].rmse:.2g}")
-    after = zip(result.rounds, shown[::2], strict=True)  # between them, what the next round adds
-    assert all(f"error {found.rmse:.2g}" in html for found, html in after)
-    assert all(html.startswith("<img src=") for html in shown[::2])
 
 
 class Terminal(io.StringIO):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import signal
 import subprocess
 import sys
@@ -13,7 +12,6 @@ import pytest
 from clusters import PATIENCE, Cluster
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.errors import MrtWarning, OutputError
 from mrt_mitsuba.rendering.progress import Progress
 
 pytest.importorskip("distributed")
@@ -95,25 +93,10 @@ def test_a_killed_sweep_frees_the_folder_and_its_pictures_are_kept(tmp_path, mon
     assert first.items() <= {path.name: path.stat().st_mtime_ns for path in out.glob("*.exr")}.items()
 
 
-def test_a_lock_file_that_a_killed_sweep_left_does_not_matter(tmp_path):
-    (tmp_path / ".mrt-sweep.lock").touch()
+def test_a_folder_of_the_users_does_not_matter(tmp_path):
     (tmp_path / ".mrt-sweep-of-the-user").mkdir()
     assert not mrt.sweep(3, tmp_path, grid={"seed": [1]}, workers=1, **SMALL).failed
     assert hidden(tmp_path) == [".mrt-sweep-of-the-user"]
-
-
-def test_without_locks_or_room_the_reason_is_said(address, tmp_path, monkeypatch):
-    def unsupported(file, operation):
-        raise OSError(95, "Operation not supported")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(fcntl, "flock", unsupported)
-        with pytest.warns(MrtWarning, match="has no file locks") as warned:
-            assert not mrt.sweep(3, tmp_path, cluster=address, **SMALL).failed
-        assert warned[0].filename == __file__
-    assert hidden(tmp_path) == []
-    with pytest.raises(OutputError, match=r"cannot (write to|make) the folder /proc"):
-        mrt.sweep(3, "/proc", **SMALL)
 
 
 def flip(data, place):
@@ -135,7 +118,7 @@ def drop(data, place):
 @pytest.mark.parametrize("damage", [flip, blank, cut, drop])
 def test_damaged_pictures_are_made_again(address, tmp_path, damage, capfd):
     """Anywhere in the file: the header, the mark of the sweep in it, the table of rows, pixels, the end."""
-    options = {"grid": {"seed": range(5)}, "png": True, "cluster": address, **SMALL}
+    options = {"grid": {"seed": range(5)}, "cluster": address, **SMALL}
     mrt.sweep(3, tmp_path, **options)
     whole = contents(tmp_path)
     names = sorted(whole)

@@ -122,10 +122,9 @@ def test_parameters_of_a_file(address, tmp_path):
     out = tmp_path / "out"
     assert cli.main(["export", "3", "--xml", str(mine)]) == 0
     grid = {"params": [{"resx": 40}, {"resx": 50}], "material_0.alpha": [0.1]}
-    table = mrt.sweep(mine, out, grid=grid, cluster=address, png=True, aa=1)
+    table = mrt.sweep(mine, out, grid=grid, cluster=address, aa=1)
     names = [f"params=resx-{n},material_0.alpha=0.1" for n in (40, 50)]
     assert [row["file"] for row in table.rows] == [f"{name}.exr" for name in names]
-    assert sorted(path.stem for path in out.glob("*.png")) == names
     for row in table.rows:
         alone = mrt.render(mine, params=row["params"] | {"material_0.alpha": 0.1}, aa=1)
         assert read_exr(out / row["file"]).image.tobytes() == alone.image.tobytes()
@@ -133,7 +132,7 @@ def test_parameters_of_a_file(address, tmp_path):
 
 def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(address, tmp_path):
     def run(**options: Any) -> dict[str, int]:
-        table = mrt.sweep(3, tmp_path, grid={"seed": [1, 2]}, cluster=address, png=True, **SMALL | options)
+        table = mrt.sweep(3, tmp_path, grid={"seed": [1, 2]}, cluster=address, **SMALL | options)
         assert len(table.rows) == 2
         assert not table.failed
         assert all(row["seconds"] > 0 and row["attempts"] == 1 for row in table.rows)
@@ -144,7 +143,7 @@ def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(address
     (tmp_path / "seed=1.exr").unlink()
     second = run()
     made_again = {name for name in first if first[name] != second[name]}
-    assert made_again == {"seed=1.exr", "seed=1.png"}
+    assert made_again == {"seed=1.exr"}
     for other in ({"fresnel": "dielectric"}, {"aa": 2}, {"aa": 2, "resume": False}):
         before = made(tmp_path)
         assert not set(before.values()) & set(run(**other).values())
@@ -164,20 +163,18 @@ def test_pictures_of_another_version_are_made_again(address, tmp_path, monkeypat
         runtime.versions.cache_clear()
 
 
-@pytest.mark.parametrize("name", ["table.csv", "seed=1.exr", "seed=1.png", "link"])
+@pytest.mark.parametrize("name", ["table.csv", "seed=1.exr", "link"])
 def test_a_file_of_the_users_own_is_refused_by_name(address, tmp_path, name):
     options: dict[str, Any] = {"grid": {"seed": [1]}, **SMALL}
     mine = tmp_path / name
     mine.write_text("file,error\nmine,\n")
     if name.startswith("seed"):
         mrt.render(0, width=8, height=8, aa=1).save(mine)
-    if name == "seed=1.png":  # next to a picture that a sweep made
-        mrt.sweep(3, tmp_path, cluster=address, **options)
     if name == "link":
         (tmp_path / "seed=1.exr").symlink_to(mine)
     before = mine.read_bytes()
     with pytest.raises(OutputError, match=r"(not made by|not the table of) a sweep.*another folder"):
-        mrt.sweep(3, tmp_path, resume=False, png=True, **options)
+        mrt.sweep(3, tmp_path, resume=False, **options)
     assert mine.read_bytes() == before
 
 
@@ -398,16 +395,6 @@ def test_the_command_interrupted_from_the_keyboard_and_again(start, waiting, tmp
     assert cli.main([*words, "workers=1"]) == 0
     assert capsys.readouterr().out.endswith(f"6 of 6 pictures in {out}\n")
     assert [row["error"] for row in written(out)] == [""] * 6
-
-
-def test_a_gpu_is_pinned_to_each_worker(tmp_path, monkeypatch):
-    """Whether there are some or not: what the driver will go by is in each worker's environment."""
-    from mrt_mitsuba.sweeps.cluster import connected  # which needs Dask
-
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,GPU-7")
-    with connected(None, 9, None, None, "cuda_ad_rgb") as client:
-        found = client.run(os.getenv, "CUDA_VISIBLE_DEVICES")
-    assert sorted(found.values()) == ["5", "GPU-7"]
 
 
 def test_the_command_says_that_a_job_failed(address, tmp_path, capsys):

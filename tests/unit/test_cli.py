@@ -174,7 +174,7 @@ def test_every_word_of_a_command_is_explained(name, capsys):
 
 
 def test_every_option_arrives_at_the_render_or_is_the_commands_own():
-    own = {"scene", "plugins", "format", "tonemap", "compression", "plan", "quiet", "log"}
+    own = {"scene", "plugins", "format", "tonemap", "compression", "plan", "quiet"}
     assert {*options.parse(["o"]).render_arguments(), *own} == {*options.TABLE, "params"}
     assert set(options.parse(["o"]).render_arguments()) <= set(inspect.signature(api.render).parameters)
     arguments = options.parse(["o", "layers=depth", "motion=1,2,3", "memory=4G"]).render_arguments()

@@ -62,7 +62,7 @@ def test_changes_and_renders_wait_for_a_render_in_another_thread(act):
     act(parameters)  # its kernels are there afterwards
     done = threading.Event()
     thread = threading.Thread(target=lambda: (act(parameters), done.set()))
-    with runtime.render_lock.lock:
+    with runtime.render_lock:
         thread.start()
         assert not done.wait(0.3)  # without the lock, it takes less than a thousandth of that
     assert done.wait(60)

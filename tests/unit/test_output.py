@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import io
 import os
 import pickle
 import signal
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -275,18 +273,6 @@ def test_an_interrupt_while_a_block_ends_leaves_nothing_behind(monkeypatch, heed
         assert signal.getsignal(signal.SIGINT) is not signal.default_int_handler
 
 
-def test_leftovers_of_killed_processes_are_removed(tmp_path, image):
-    names = (16 * "0", 16 * "1", 16 * "2", "a-file-of-the-user")
-    left, alive, recent, own = (tmp_path / f".mrt-{name}.tmp" for name in names)
-    with alive.open("wb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        for path, made in ((left, 0), (alive, 0), (recent, time.time() - 1), (own, 0)):
-            path.touch()
-            os.utime(path, (made, made))
-        output.save(tmp_path / "a.png", image)
-    assert sorted(tmp_path.iterdir()) == [alive, recent, own, tmp_path / "a.png"]
-
-
 def test_link_stays_and_its_target_is_replaced(tmp_path, image):
     target = tmp_path / "b.png"
     (tmp_path / "a.png").symlink_to(target)
@@ -338,25 +324,6 @@ def test_no_file_is_replaced_that_the_scene_was_read_from(tmp_path):
             result.save(tmp_path / "new.exr", tmp_path / name)
     assert {path: path.read_bytes() for path in before} == before
     assert not (tmp_path / "new.exr").exists()
-
-
-LEAVE = "import os, shutil, sys; shutil.rmtree(os.getcwd())\n"
-
-
-@pytest.mark.parametrize(
-    ("way", "words"),
-    [
-        ("import mrt_mitsuba as mrt\ntry: mrt.render(0)\nexcept mrt.MrtError as e: sys.exit(e)", ""),
-        ("from mrt_mitsuba.command.main import main\nsys.exit(main())", "out"),
-        ("from mrt_mitsuba.validation.cli import main\nsys.exit(main())", "scenes"),
-    ],
-    ids=["render", "mrt", "mrt-validate"],
-)
-def test_a_deleted_working_folder_is_named(run_python, way, words):
-    """Mitsuba itself ends in an ImportError there, and then by a signal."""
-    said = run_python(LEAVE + way, *words.split(), code=1).stderr
-    assert "the working folder has been deleted" in said
-    assert said.count("\n") == 1
 
 
 SENSORS = {

@@ -25,7 +25,7 @@ mi.register_bsdf("{}", Shiny)
 
 @pytest.fixture(autouse=True)
 def apart(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(user_plugins, "_named", {})
+    monkeypatch.setattr(user_plugins, "_named", [])
     monkeypatch.chdir(tmp_path)
 
 
@@ -47,9 +47,6 @@ def test_a_file_is_registered_in_each_variant_and_once_in_each(variant, tmp_path
         mi.set_variant(before)
     assert len((tmp_path / "log").read_text().splitlines()) == len({"scalar_rgb", "llvm_ad_mono", before})
     assert sys.modules["numpy"] is numpy
-    (tmp_path / "numpy.py").write_text(SHINY.format(2, "shiny_file"))
-    user_plugins.load(tmp_path / "numpy.py")
-    assert made("shiny_file") == "Shiny[2]"
 
 
 def test_packages_and_modules_by_name(variant, tmp_path, monkeypatch):

@@ -317,9 +317,8 @@ def _(mesh: Mesh, o: Array, d: Array) -> Met:
         weights = [1 - u[k] - v[k], u[k], v[k]]
         uvs = np.asarray(mesh.uvs, float)[mesh.faces[face[k]]]
         across, down = np.clip(np.einsum("cn,nci->in", weights, uvs), 0, 1)
-        base, gain = mesh.material.texture_range
         with Image.open(str(mesh.material.texture)) as picture:
-            texels = base + gain * np.asarray(picture.convert("RGB")) / 255
+            texels = np.asarray(picture.convert("RGB")) / 255
         rows, columns = texels.shape[:2]
         row = (down * (rows - 1) + 0.5).astype(int)
         column = (across * (columns - 1) + 0.5).astype(int)
