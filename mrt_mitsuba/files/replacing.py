@@ -16,7 +16,6 @@ from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.options import StrPath
 
-
 TEMPORARY = ".mrt-{}.tmp"
 
 

@@ -37,5 +37,8 @@ def reserved(folder: str) -> Iterator[None]:
         try:
             yield
         finally:
-            for left in (path, *Path(folder).glob(TEMPORARY.format("*"))):  # of workers that were killed
-                Path(left).unlink(missing_ok=True)
+            for left in (
+                Path(path),
+                *Path(folder).glob(TEMPORARY.format("*")),
+            ):  # of workers that were killed
+                left.unlink(missing_ok=True)
