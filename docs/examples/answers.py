@@ -171,6 +171,7 @@ def switches() -> pages.Markdown:
     """What each switch of the ledger changes in a picture."""
     textured, cone = report_scene(8), report_scene(9)
     house = Path(__file__).parent / "house.obj"
+    focus = {"focaldist": 3.0, "focalrange": 0.5}
     moving = {"aa": 2, "motion": (0.25, 0, -0.25), "motionsamples": 8}
     unclamped = {"integrator": {"type": "mrt_whitted", "clamp": False}}
     changes: dict[str, tuple[Render, Render]] = {
@@ -180,6 +181,7 @@ def switches() -> pages.Markdown:
         "Clamp of each light": ((1, {}), (1, unclamped)),
         "Fresnel": _option(3, "fresnel", "schlick", "dielectric"),
         "Sobel, to every pixel": _option(3, "aamode", "sobel", "none", aa=4),
+        "Depth of field": _option(3, "dof", "report", "corrected", **focus),
         "The cone and its shadow": (
             (cone, {}),
             (replace(cone, cones=()), {}),

@@ -135,6 +135,7 @@ def render(  # noqa: PLR0913 - each option has a name that editors show
     fresnel: Literal["schlick", "dielectric"] | None = None,
     focaldist: float | None = None,
     focalrange: float | None = None,
+    dof: Literal["report", "corrected"] = "report",
     layers: Sequence[str] | str = (),
     motion: Sequence[float] | None = None,
     motionsamples: int = 16,

@@ -218,7 +218,7 @@ class Passes:
         for rows, wide, inner in self._bands(dof.REACH):
             sharp = image[rows.start : wide.stop]
             sharp = np.concatenate([above, sharp]) if len(above) else sharp
-            blurred = filters.gaussian_dof(sharp, depth[wide], **focus)
+            blurred = filters.gaussian_dof(sharp, depth[wide], mode=step.mode, **focus)
             above = sharp[: inner.stop][-dof.REACH :].copy()
             image[rows] = blurred[inner]
             if amount is not None:

@@ -143,11 +143,12 @@ class Blur(Pass):
     name = "depth of field"
     message = "Computing depth of field.."  # as the original program prints it
     gives = frozenset({"depth"})
+    mode: str  #: "report" or "corrected"
     focal_distance: float  #: that is sharp, from the camera in units of the scene
     focal_range: float  #: half-width of the sharp zone around it
 
     def __str__(self) -> str:
-        return "depth of field"
+        return f"depth of field: {self.mode}"
 
 
 # ----------------------------------------- The plan -------------------------------------------
@@ -436,7 +437,7 @@ def _passes(
             yield Refinement(layers=traced - at_centre - {"square"}, pattern=_samples(settings, first))
     if settings.focaldist and settings.focalrange is not None:
         focus: dict[str, Any] = {"focal_distance": settings.focaldist, "focal_range": settings.focalrange}
-        yield Blur(**focus)
+        yield Blur(mode=settings.dof, **focus)
 
 
 def _samples(settings: RenderSettings, first: int = 0) -> SamplePattern:

@@ -1,16 +1,16 @@
 """The options of ``mrt.render``: ``RenderSettings`` holds and checks them, also for the command, which adds
-its own.
+its own; ``RenderOptions`` has their types for editors.
 
-A new option is a field here and a parameter of ``render``.
+A new option is a field, a type in ``RenderOptions`` and a parameter of ``render``.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from mrt_mitsuba.adaptive.target import METRIC_NAMES, Goal, Target
 from mrt_mitsuba.errors import UsageError
@@ -53,6 +53,49 @@ NOISE = "noise"  # the aamode that allocates samples by variance
 MIN_SPP = 16  # samples per pixel from which the variance is estimated
 MAX_SPP = 4096  # mean samples per pixel, where a target alone would ask for more
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
+
+
+class SharedOptions(TypedDict, total=False):
+    """The options of ``render`` that each render of a sweep may have, for type checkers."""
+
+    width: int | None
+    height: int | None
+    aa: int | None
+    aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None
+    target: Target | float | str | Sequence[float] | None
+    metric: Literal["linear", "relative", "display"] | None
+    denoise: bool
+    maxspp: int | None
+    maxseconds: float | None
+    lattice: Lattice | None
+    fresnel: Literal["schlick", "dielectric"] | None
+    focaldist: float | None
+    focalrange: float | None
+    dof: Literal["report", "corrected"]
+    layers: Sequence[str] | str
+    motion: Sequence[float] | None
+    motionsamples: int
+    convention: Convention
+    texturing: Convention | None
+    camera: Sequence[float] | None
+    up: Sequence[float] | None
+    fov: float | None
+    light: Sequence[float] | None
+    variant: str | None
+    memory: int | str | None
+    seed: int
+    integrator: Any
+    sensor: int
+    on_round: Callable[[RoundPicture], object] | None
+    spp: int | None
+    count_rays: bool
+    params: Mapping[str, Any] | None
+
+
+class RenderOptions(SharedOptions, total=False):
+    """The options of ``render`` as type checkers see them where a function takes ``**options``."""
+
+    progress: Progress | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,6 +149,9 @@ class RenderSettings:
     )
     focalrange: float | None = option(
         None, NUMBER, "half-width of the sharp zone around it", "from the scene"
+    )
+    dof: str = option(
+        "report", choice("report", "corrected"), "depth of field as in the report, or without its flaws"
     )
     layers: tuple[str, ...] = option(
         (), subset(LAYERS), f"more EXR layers: all, or some of {', '.join(LAYERS)}", "none"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import ExitStack, closing
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba import runtime, user_plugins
 from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
@@ -16,6 +16,11 @@ from mrt_mitsuba.sweeps.jobs import check_parameters, jobs, points
 from mrt_mitsuba.sweeps.pictures import is_fresh
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.worker import describe
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from mrt_mitsuba.rendering.settings import SharedOptions
 
 
 def sweep(  # noqa: PLR0913 - each option has a name that editors show
@@ -30,7 +35,7 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
     resume: bool = True,
     plugins: Any = (),
     progress: Progress | None = None,
-    **options: object,
+    **options: Unpack[SharedOptions],
 ) -> Table:
     """Render every combination of a grid's values on several processes or machines.
 

@@ -184,6 +184,30 @@ def test_weights_begin_anew_at_the_lower_and_the_left_border():
         assert_allclose(found[picture > 0], 1 / 16, atol=1e-7)
 
 
+@pytest.mark.parametrize("amount", [0.5, 2, 8])
+def test_a_point_becomes_a_disc_as_wide_as_pascal_s_triangle(amount):
+    image = np.zeros((41, 41, 3), np.float32)
+    image[20, 20] = 1
+    depth = np.full((41, 41), 1 + amount)
+    found = gaussian_dof(image, depth, focal_distance=1.0, focal_range=0, mode="corrected")[..., 0]
+    assert found.sum() == pytest.approx(1, abs=1e-5)
+    variance = (found * (np.arange(41) - 20) ** 2).sum()
+    expected = (2 * amount - 1) / 4 if amount >= 1 else amount**2 / 4
+    assert variance == pytest.approx(expected, rel=0.1)  # a small disc on a grid of pixels
+
+
+def test_a_blurred_foreground_covers_and_a_background_does_not():
+    """What is sharp takes nothing from behind it; in the middle of a foreground nothing shows through."""
+    image = np.zeros((41, 41, 3), np.float32)
+    image[:, 20:] = 1
+    for first, second in ((3.0, 9.0), (9.0, 3.0)):  # the left half, the right one
+        depth = np.where(np.arange(41) < 20, first, second) * np.ones((41, 1))
+        found = gaussian_dof(image, depth, focal_distance=first, focal_range=0, mode="corrected")[20, :, 0]
+        assert_allclose(found[30:35], 1, atol=1e-6)
+        assert (found[15:20] > 0.01).any() == (second < first)
+        assert not found[:10].any()
+
+
 def test_what_is_in_focus_neither_blurs_nor_gives():
     image, depth = scene((30, 40), 2)
     depth[:, 20:] = 3
@@ -194,12 +218,13 @@ def test_what_is_in_focus_neither_blurs_nor_gives():
     assert_array_equal(found[:, :20], blurred[:, :20])
 
 
-def test_a_bad_colour_gives_nothing():
+@pytest.mark.parametrize("mode", ["report", "corrected"])
+def test_a_bad_colour_gives_nothing(mode):
     image = np.full((25, 30, 3), 0.75)
     image[12, 15, 2] = image[3, 0, 0] = np.nan
     good = np.isfinite(image).all(axis=-1)
     for amount in (np.full((25, 30), 8.0), np.arange(750.0).reshape(25, 30) % 9):
-        found = gaussian_dof(image, 1 + amount, focal_distance=1.0, focal_range=0)
+        found = gaussian_dof(image, 1 + amount, focal_distance=1.0, focal_range=0, mode=mode)
         # the weights of what is left add up to one, but for the rounding of their sums of 61 terms at most
         assert_allclose(found[good], 0.75, rtol=61 * 6e-8)
 

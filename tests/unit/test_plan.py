@@ -79,10 +79,10 @@ def test_what_the_integrator_does_not_say_is_not_made_up():
 
 shown = Cases()
 shown({"aamode": "none", "focaldist": 0}, "16 samples per pixel")
-shown({"aamode": "none"}, "16 samples per pixel, with depth; depth of field")
+shown({"aamode": "none"}, "16 samples per pixel, with depth; depth of field: report")
 shown(
     {"aamode": "none", "lattice": "centered"},
-    "first hits: 1 ray through each pixel's centre, with depth; 16 samples per pixel; depth of field",
+    "first hits: 1 ray through each pixel's centre, with depth; 16 samples per pixel; depth of field: report",
 )
 shown({"focaldist": 0, "aa": 2}, "1 sample per pixel; edge detection: sobel; 3 more samples in edge pixels")
 shown(
@@ -118,6 +118,7 @@ VALUES = {
     "fresnel": "dielectric",
     "focaldist": 1,
     "focalrange": 9,
+    "dof": "corrected",
     "layers": ["normal"],
     "motion": (1, 0, 0),
     "motionsamples": 3,
