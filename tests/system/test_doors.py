@@ -73,21 +73,6 @@ def test_a_render_inside_freeze_is_refused_with_the_way_out():
     assert np.isfinite(mrt.render(scene, integrator="path", spp=2).image).all()  # nothing is left behind
 
 
-@pytest.mark.parametrize("target", ["-1%", "2 %"])
-def test_a_percentage_that_is_none_is_refused_by_every_door(target, tmp_path):
-    with pytest.raises(UsageError, match="target="):
-        mrt.render(0, target=target)
-    with pytest.raises(RuntimeError, match="percentage"):
-        mi.load_dict(adaptive(target=target))
-    file = tmp_path / "scene.xml"
-    file.write_text(
-        '<scene version="3.0.0"><integrator type="mrt_adaptive"><string name="target" '
-        f'value="{target}"/><integrator type="path"/></integrator></scene>'
-    )
-    with pytest.raises(RuntimeError, match="percentage"):
-        mi.load_file(str(file))
-
-
 goals = Cases()
 goals({"spp": 20}, {}, 20, None, name="its own rays")
 goals({"target": 9.0}, {}, 4096, 9.0, name="its own target")

@@ -161,16 +161,7 @@ def test_a_header_says_that_an_error_has_no_upper_end():
     assert result.header()["mrt:error"]["high"] is None
 
 
-# ----------------------------------- Random numbers, blur, NaN -----------------------------------
-
-
-def test_seeds_decide_the_rays_of_a_target():
-    """Two seeds of a target share no random numbers."""
-    first, second = (
-        mrt.render(camera(32, 24), integrator=noise(), target=0.05, seed=seed).image for seed in (1, 2)
-    )
-    assert np.mean(first == second) < 0.01
-    assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.1  # of 768 pixels: 0.04
+# ----------------------------------- Blur, NaN -----------------------------------
 
 
 def test_a_filter_widens_the_interval_by_the_correlation_of_pixels():

@@ -139,14 +139,3 @@ def test_every_integrator_gives_pictures_with_their_error(name):
     assert 0 < result.error.low < result.error.rmse < 0.08
     assert result.rounds[-1].rmse == result.error.rmse
     assert result.error.high > result.error.rmse
-
-
-def test_scalar_variants_follow_the_film():
-    film = {"type": "hdrfilm", "width": 6, "height": 4}
-    scene = {"type": "scene", "sensor": {"type": "perspective", "film": film}}
-    scene |= {"light": {"type": "constant"}, "ball": {"type": "sphere", "center": [0, 0, 4]}}
-    assert mrt.render(scene, integrator="path", variant="scalar_rgb", target=0.1, maxspp=32).error.rmse < 0.1
-    inside = {"type": "mrt_adaptive", "target": 0.1, "max_spp": 32, "nested": {"type": "path"}}
-    picture = np.array(mi.render(mi.load_dict(scene), integrator=mi.load_dict(inside)))
-    assert picture.shape == (4, 6, 5)
-    assert picture[..., -1].max() > 8

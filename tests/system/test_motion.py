@@ -62,22 +62,6 @@ def test_frames_are_the_mean_of_renders_from_shifted_cameras(options):
     assert blurred.rays["primary"] == pytest.approx(sum(frame.rays["primary"] for frame in frames), rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    "options", [{"aamode": "none"}, {"aamode": "luma", "aa": 2, "lattice": "report"}], ids=str
-)
-def test_random_frames_draw_numbers_of_their_own(options):
-    """A camera that stands still: n frames are n times the rays, and the noise falls by √n."""
-    scene = mi.load_dict(mrt.scene_dict(0, width=48, height=36, flavor="stock"))
-    options = {"integrator": {"type": "path", "max_depth": 4}, "aa": 1, "motion": (0, 0, 0), **options}
-
-    def noise(frames: int) -> float:
-        images = [mrt.render(scene, **options, motionsamples=frames, seed=seed).image for seed in (11, 5000)]
-        return float(np.sqrt(np.mean(np.subtract(*images) ** 2)))
-
-    # a quarter of the noise; the ratio of two deviations over 5184 values is good to 3 %
-    assert noise(16) == pytest.approx(noise(1) / 4, rel=0.15)
-
-
 @pytest.mark.parametrize("lattice", ["report", "centered"])
 def test_depth_is_that_of_the_moment_when_the_shutter_opens(lattice):
     options = {**SMALL, "aa": 2, "aamode": "none", "layers": ["depth"], "motionsamples": 4}

@@ -115,18 +115,6 @@ def test_mrt_adaptive_shows_of_aov_what_mitsuba_shows(inner, pixel_format):
     assert_allclose(picture[..., :-2].mean((0, 1)), expected.mean((0, 1)), atol=0.1)
 
 
-@pytest.mark.parametrize("door", ["mi.render", "mrt.render", "prepare", "target"])
-def test_integrators_without_to_string(door):
-    loaded = scene(of_the_user("a"))
-    doors = {
-        "mi.render": lambda: np.array(mi.render(loaded))[..., :3],
-        "mrt.render": lambda: mrt.render(loaded).image,
-        "prepare": lambda: mrt.prepare(loaded)().image,
-        "target": lambda: mrt.render(loaded, target="2%").image,
-    }
-    assert_allclose(doors[door](), 0.25, rtol=1e-5)
-
-
 @pytest.mark.parametrize("options", [{}, {"spp": 4}], ids=str)
 @pytest.mark.parametrize("base", ["SamplingIntegrator", "prb"])
 def test_an_integrator_may_render_by_itself(base, options):

