@@ -30,7 +30,8 @@ from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.rendering.progress import Progress
 
-Client = pytest.importorskip("distributed").Client
+distributed = pytest.importorskip("distributed")
+Client = distributed.Client
 pytestmark = pytest.mark.attack
 
 SMALL = {"width": 64, "height": 48, "aa": 1}
@@ -422,9 +423,9 @@ mi.register_bsdf("grey", Grey)
 """
 
 
-class Listening(Progress):
+class Knocking(Progress):
     """Notes the addresses at which this process and its descendants listen while a sweep runs, and did not
-    before it, as clusters of other tests do."""
+    before it, as clusters of other tests do; and knocks without the sweep's key."""
 
     def __init__(self) -> None:
         self.before = self.listeners()
@@ -436,6 +437,10 @@ class Listening(Progress):
 
     def note(self, steps: int) -> None:
         self.addresses |= {ip for ip, _ in self.listeners() - self.before}
+        (cluster,) = (each for each in distributed.SpecCluster._instances if each.status.name == "running")
+        address = cluster.scheduler_address.replace("tls://", "tcp://")
+        with pytest.raises(OSError):
+            Client(address, timeout=1, set_as_default=False)
 
     def listeners(self) -> set[tuple[str, int]]:
         """Addresses and ports."""
@@ -460,17 +465,6 @@ def test_a_sweep_of_this_machine_is_closed_to_others(tmp_path, monkeypatch):
         "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": "texture.png"}},
     }
 
-    class Knocking(Listening):
-        def note(self, steps: int) -> None:
-            super().note(steps)
-            (cluster,) = (
-                each for each in distributed.SpecCluster._instances if each.status.name == "running"
-            )
-            address = cluster.scheduler_address.replace("tls://", "tcp://")
-            with pytest.raises(OSError):
-                Client(address, timeout=1, set_as_default=False)
-
-    distributed = pytest.importorskip("distributed")
     listening = Knocking()
     table = mrt.sweep(scene, "out", plugins="mine.py", workers=1, progress=listening, **SMALL)
     assert not table.failed
@@ -478,6 +472,10 @@ def test_a_sweep_of_this_machine_is_closed_to_others(tmp_path, monkeypatch):
     assert not (tmp_path / "was-run").exists()
     alone = mrt.render(scene, **SMALL)
     assert read_exr(tmp_path / "out" / "picture.exr").image.tobytes() == alone.image.tobytes()
+    before = made(tmp_path / "out")
+    (tmp_path / "mine.py").write_text(PLUGIN + "# another version\n")
+    mrt.sweep(scene, "out", plugins="mine.py", workers=1, **SMALL)
+    assert not set(before.values()) & set(made(tmp_path / "out").values())
 
 
 def test_what_a_file_holds_is_never_unpickled(tmp_path):

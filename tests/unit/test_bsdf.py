@@ -224,14 +224,6 @@ def test_colours_and_numbers_from_textures():
         assert_allclose(diffuse, [numbers["diffuse_reflectance"][i]] * 100, rtol=1e-6)
 
 
-def test_samples_of_two_lobes_weigh_the_same():
-    """The albedo that chooses a lobe has Fresnel's reflectance in it: seen from the normal, 0.04 of gloss."""
-    b = bsdf(alpha=1e-3, fresnel="dielectric", diffuse_reflectance=0.3, specular_reflectance=0.9)
-    drawn = draw(b, at_angle(20), 10_000)
-    assert set(drawn.lobe) == {0, 1}
-    assert_allclose(drawn.weight, np.mean(drawn.weight), rtol=1e-3)
-
-
 COLOR = (1.5, 1.2, 1.0)
 CYAN = (0.1, 2.0, 2.5)
 

@@ -319,22 +319,6 @@ def test_a_checked_plugin_is_named_and_let_go(answer, loaded):
         gc.enable()
 
 
-def test_a_number_counts_as_a_color():
-    """As for Mitsuba, which also takes a list for a tuple."""
-
-    class Grey(power.changed_bsdf({})):
-        def eval(self, *given):
-            return super().eval(*given).x
-
-        def sample(self, *given):
-            bs, weight = super().sample(*given)
-            return [bs, weight.x]
-
-    mi.register_bsdf("grey", Grey)
-    check = mrt.check_bsdf({"type": "grey", "change": "", "nested": {"type": "diffuse"}}, quick=True)
-    assert set(check.failed) <= {"variants"}, str(check)
-
-
 def test_a_bsdf_without_a_method_of_its_own_fails():
     class Bare(mi.BSDF):
         def __init__(self, props):

@@ -8,25 +8,32 @@ import signal
 import sys
 import time
 import warnings
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from cases import Cases
+from PIL import Image
 
 from mrt_mitsuba.command import main as cli
 from mrt_mitsuba.command import options, registry
 from mrt_mitsuba.errors import MrtError, MrtWarning, SceneError
+from mrt_mitsuba.files.images import to_8bit
 from mrt_mitsuba.rendering import api
 
 SMALL = ("width=16", "height=12")
 
 
-def test_a_self_test_that_fails_is_a_failure(monkeypatch, capsys):
-    def broken(*scene: object, **options: object) -> None:
-        raise MrtError("no kernel")
+@pytest.mark.parametrize(("picture", "says"), [(None, "no kernel"), (np.zeros((12, 16, 3)), "scene 0 has")])
+def test_a_self_test_that_fails_is_a_failure(monkeypatch, capsys, picture, says):
+    def broken(*scene: object, **options: object) -> object:
+        if picture is None:
+            raise MrtError("no kernel")
+        return SimpleNamespace(image=picture)
 
     monkeypatch.setattr(api, "render", broken)
     assert cli.main(["doctor"]) == 1
-    assert "self-test: FAILED: no kernel" in capsys.readouterr().out
+    assert f"self-test: FAILED: {says}" in capsys.readouterr().out
 
 
 def test_render_writes_and_says_what_the_report_says(tmp_path, capsys):
@@ -47,9 +54,13 @@ def test_render_writes_and_says_what_the_report_says(tmp_path, capsys):
 
 
 def test_quiet_prints_nothing(tmp_path, capsys):
-    assert cli.main([str(tmp_path / "out"), *SMALL, "quiet=1", "plan=show", "format=png"]) == 0
+    words = [*SMALL, "quiet=1", "plan=show", "format=png", "tonemap=srgb"]
+    assert cli.main([str(tmp_path / "out"), *words]) == 0
     assert capsys.readouterr() == ("", "")
     assert [path.name for path in tmp_path.iterdir()] == ["out.png"]
+    with Image.open(tmp_path / "out.png") as png:
+        shown = to_8bit(api.render(0, width=16, height=12).image, "srgb")
+        assert np.array_equal(np.asarray(png), shown)
 
 
 def test_listings(capsys):

@@ -119,6 +119,17 @@ def test_what_a_screen_clips_counts_only_as_it_is_shown():
     assert (plain.error[:, SIZE * 3 // 4 :] > 1e-3).all()
 
 
+def test_no_pixel_decides_its_own_weight(monkeypatch):
+    """That of its neighbours it does: so the stated error of the mixture is honest."""
+    module = sys.modules["mrt_mitsuba.filters.denoise"]
+    monkeypatch.setattr(module, "_open_image_denoise", lambda *_: np.float32(SMOOTH + 0.07))
+    halves = [noisy(SMOOTH, seed, 0.1) for seed in range(2)]
+    before = filters.denoise(*halves).weight
+    halves[0][50, 50] += 1
+    change = abs(filters.denoise(*halves).weight - before)[50]
+    assert change[50] < 1e-6 < 1e-3 < change[52]
+
+
 def test_features_keep_what_noise_hides():
     """Stripes are lost in the noise, unless the albedo shows them."""
     stripes = np.where(column // 2 % 2, 0.3, 0.7)[..., None] * np.ones(3, np.float32)

@@ -210,12 +210,6 @@ def test_names_of_materials(model, name, use, found):
     assert found or f"model.obj:6: no library has the material '{use}'" in said[0]  # where it is used first
 
 
-def test_a_name_that_two_materials_could_mean_is_unknown(model):
-    library = "newmtl red # one\nKd 0.25\nnewmtl red # two\nKd 0.5\n"
-    with pytest.warns(mrt.MrtWarning, match="no library has the material 'red'"):
-        model(f"mtllib model.mtl\n{SQUARE}usemtl red\nf 1 2 3\n", library)
-
-
 def test_the_first_library_that_has_a_material_counts(model, tmp_path):
     for name, value in (("a.mtl", 0.25), ("my b.mtl", 0.5)):
         (tmp_path / name).write_text(f"newmtl m\nKd {value}\nnewmtl {name[-5]}\nKd {value}\n")
