@@ -106,31 +106,31 @@ def _off(ours: object, theirs: object, truth: Array) -> Curves:
 # ------------------------------------------ Reflectance ------------------------------------------
 
 
-def _lobes(count: int, cosine: Array, alpha: float) -> Curves:
-    """Measure the lobe D G / (4 cos θi), without Fresnel, for light from these cosines [count].
+def lobes(cosine: Array, alpha: float, steepest: float = 4.0) -> Curves:
+    """Measure the lobe D G / (4 cos θi), without Fresnel, for light from these cosines [N].
 
-    Half vectors are within twice the slope alpha.
+    tan²θh / alpha² of half vectors is at most ``steepest``: D is at least exp(-steepest) of its peak.
     """
     rng = np.random.default_rng(11)
-    wi, wo = pairs_about(cosine, 2 * alpha * np.sqrt(rng.random(count)), rng)
-    up = wo[:, 2] > 0
+    wi, wo = pairs_about(cosine, alpha * np.sqrt(steepest * rng.random(len(cosine))), rng)
+    up = wo[:, 2] > 5e-8
     wi = wi[up]
     wo = wo[up]
     a = np.float32(alpha)
     truth = [exact.lobe(i, o, exact.number(a)).value for i, o in zip(wi, wo, strict=True)]
     bsdfs = (roughconductor.ours(float(a)), roughconductor.theirs(float(a)))
-    lobes = [evaluate(mi.load_dict(bsdf), wi, wo)[0][:, 0] for bsdf in bsdfs]
-    return _off(*lobes, np.array(truth, float))
+    found = [evaluate(mi.load_dict(bsdf), wi, wo)[0][:, 0] for bsdf in bsdfs]
+    return _off(*found, np.array(truth, float))
 
 
 def roughness(alpha: float, count: int) -> Curves:
     """Measure the lobe at a roughness, for directions that are not grazing."""
-    return _lobes(count, np.random.default_rng(3).uniform(0.2, 1, count), alpha)
+    return lobes(np.random.default_rng(3).uniform(0.2, 1, count), alpha)
 
 
 def grazing(cosine: float, count: int) -> Curves:
     """Measure a lobe of roughness 0.3 at so small a cosine of the light's direction."""
-    return _lobes(count, np.full(count, cosine), 0.3)
+    return lobes(np.full(count, cosine), 0.3)
 
 
 def index(above: float, count: int) -> Curves:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.linalg import norm
@@ -16,10 +14,10 @@ from mrt_mitsuba.plugins import fresnel
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.bsdf_probe import pairs_about
 from mrt_mitsuba.validation.laws.bsdf import check_bsdf
 from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.oracles.reference import reference_render, unit
+from mrt_mitsuba.validation.studies.stability import axes
 from mrt_mitsuba.validation.study import Values
 
 
@@ -38,36 +36,24 @@ class Case:
 
 REFLECTANCE = (
     "Relative errors at the same float32 numbers against 50 digits. Directions are what their components "
-    "say, and the half vector is their sum; the gradient's error is relative to the sum of the sizes of its "
-    "terms, since their sum passes through zero."
+    "say, and the half vector is their sum."
 )
-# Of tan²θh / alpha², minus the logarithm of exp(-…): the lobe is at 1e-7 of its peak, and at 1e-20
-IN_BOUND, STEEPEST = -np.log([1e-7, 1e-20])
+STEEPEST = -np.log(1e-20)  # of tan²θh / alpha²: there the lobe is at 1e-20 of its peak
 IORS = np.array([1.5, 1.33, 3, 1 + 1e-7, 1 - 1e-7, 0.5, 1e-3, 1e6], np.float32)
-# The first limit holds where D is at least 1e-7 of its peak, for alpha 1e-4 … 1: 80 roundings, for the
-# argument of exp is up to 16 there, and its error is multiplied by as much. The second holds on the whole
-# grid, where the argument of exp goes to 46: 46 times the 4 roundings of tan²/alpha², and those of the other
-# factors
-WITH_EXP = 5e-6, 2e-5
-# The value, which is the BSDF times cos θo; the density of visible normals; the derivative of the value with
-# respect to alpha; and the sum of the sizes of the terms of that derivative
-TRUTH = ("BSDF cos", "pdf", "gradient", "slope")
 EXTREME = (0.0, 1e-8, 1e-3, 1.0, 100.0, -0.4)  # roughnesses
-
-Arrays = dict[str, np.ndarray]
 
 
 def reflectance(quick: bool) -> Iterator[Case]:
-    """Yield errors of the value, its density and its gradient, of F, and whether all is finite."""
-    lobes = lobes_with_truth(2_000 if quick else 8_000)
-    usual = (abs(np.log10(lobes["alpha"]) + 2) < 2) & (lobes["steepness"] <= IN_BOUND)
-    for name, error in errors(lobes).items():
-        where = "alpha 1e-4 … 1, D ≥ 1e-7 of its peak"
-        yield Case(f"{name}, p99.9", where, "a few roundings", np.quantile(error[usual], 0.999), WITH_EXP[0])
-        where = "alpha 1e-8 … 100, D ≥ 1e-20 of its peak"
-        yield Case(f"{name}, largest", where, "roundings, which exp enlarges", error.max(), WITH_EXP[1])
+    """Yield errors of the lobe and of F, and whether all is finite."""
     count = 60 if quick else 600
-    cosines = np.float32(10 ** np.random.default_rng(4).uniform(-7, 0, count * len(IORS)))
+    rng = np.random.default_rng(4)
+    where = "D ≥ 1e-20 of its peak, cosines 1e-7 … 1"
+    # the argument of exp goes to 46: 46 times the 4 roundings of tan²/alpha², and those of the other factors
+    why = "a few roundings, which exp enlarges"
+    for alpha in np.logspace(-8, 2, 11).tolist():
+        found = axes.lobes(10 ** rng.uniform(-7, 0, count), alpha, STEEPEST)[axes.OURS]
+        yield Case(f"value, alpha {alpha:g}", where, why, found.max() * axes.ROUNDING, 2e-5)
+    cosines = np.float32(10 ** rng.uniform(-7, 0, count * len(IORS)))
     worst = fresnel_error(cosines, np.repeat(IORS, count))
     yield Case("F, largest", "cosines 1e-7 … 1, IOR 1e-3 … 1e6", "a few roundings", worst, 2e-6)
     # where total reflection begins, F ends in a square root: errors are those of g = 0
@@ -92,68 +78,6 @@ def fresnel_error(cosines: np.ndarray, iors: np.ndarray) -> float:
     truth = [float(exact.fresnel_dielectric(c, 1, n)) for c, n in zip(cosines, iors, strict=True)]
     found = np.array(fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors)), np.float64)
     return float(abs(found / truth - 1).max())
-
-
-def errors(lobes: Arrays) -> Arrays:
-    """Return the relative errors [N] of the plugin, by quantity."""
-    alpha = mi.Float(lobes["alpha"])
-    wi = mi.Vector3f(lobes["wi"].T)
-    wo = mi.Vector3f(lobes["wo"].T)
-    dr.enable_grad(alpha)
-    bsdf = mi.load_dict({"type": "mrt_bsdf", "fresnel": "dielectric", "diffuse_reflectance": 0.0})
-    parameters = mi.traverse(bsdf)
-    parameters["alpha"] = alpha
-    parameters["int_ior"] = mi.Float(lobes["ior"])
-    parameters.update()
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.wi = wi
-    value, pdf = bsdf.eval_pdf(mi.BSDFContext(mi.TransportMode.Radiance, 0xFFFFFFFF, 1), si, wo)
-    dr.forward(alpha)
-    slope = np.array(dr.grad(value[0]), float)
-    found = {"BSDF cos": value[0], "pdf": pdf}
-    of = {name: abs(np.array(dr.detach(x), float) / lobes[name] - 1) for name, x in found.items()}
-    of["gradient in alpha"] = abs(slope - lobes["gradient"]) / lobes["slope"]
-    return {name: np.where(np.isnan(error), np.inf, error) for name, error in of.items()}
-
-
-@cache
-def lobes_with_truth(count: int) -> Arrays:
-    """Return ``count`` pairs of directions, or a third more, above the surface, evenly on logarithmic scales.
-
-    By name, for N pairs: the directions ``wi`` and ``wo`` [N, 3], ``alpha``, ``ior``, the ``steepness``
-    tan²θh / alpha², and the exact values of ``TRUTH`` [N].
-    """
-    # a third of them points down
-    rng = np.random.default_rng(2)
-    drawn = 2 * count
-    alpha = np.float32(10 ** rng.uniform(-8, 2, drawn))
-    cosine = 10 ** rng.uniform(-7, 0, drawn)
-    slope = alpha * np.sqrt(STEEPEST * rng.random(drawn) ** 2)
-    wi, wo = pairs_about(cosine, slope, rng)
-    x, y, z = (np.float64(wi) + wo).T  # along the half vector
-    steepness = (x**2 + y**2) / (z * alpha) ** 2
-    keep = (wo[:, 2] > 5e-8) & (steepness < STEEPEST)
-    pairs = {"wi": wi, "wo": wo, "alpha": alpha, "ior": rng.choice(IORS, drawn)}
-    pairs = {name: values[keep] for name, values in pairs.items()}
-    truth = np.array([_exact(*pair) for pair in zip(*pairs.values(), strict=True)])
-    return pairs | {"steepness": steepness[keep]} | dict(zip(TRUTH, truth.T, strict=True))
-
-
-def _exact(wi: Sequence[float], wo: Sequence[float], alpha: float, ior: float) -> list[float]:
-    """Return the values of ``TRUTH`` for a pair of directions."""
-    a = exact.number(alpha)
-    step = a * exact.mpf("1e-20")
-    lobe = exact.lobe(wi, wo, a)
-    # Components are not rounded again: the cosine between the directions is that of them made one unit long
-    sides = zip(exact.unit(list(wi)), exact.unit(list(wo)), strict=True)
-    half = exact.mp.sqrt(sum((p + q) ** 2 for p, q in sides)) / 2
-    value = lobe.value * exact.fresnel_dielectric(half, 1, ior)
-    density = lobe.d / (4 * exact.Beckmann.visible_cos(wi, a))
-    # of the logarithms of D, 2 (tan²/alpha² - 1) / alpha, and of both G₁
-    slopes = [(exact.Beckmann.g1(v, a + step) / exact.Beckmann.g1(v, a) - 1) / step for v in (wi, wo)]
-    terms = [2 * lobe.tan2 / a**3, -2 / a, *slopes]
-    values = (value, density, value * sum(terms), value * sum(map(abs, terms)))
-    return [float(x) for x in values]
 
 
 # ---------------------------------------------- Light paths ----------------------------------------------
