@@ -33,15 +33,14 @@ Array = np.ndarray
 
 
 class ReferenceResult(NamedTuple):
-    """A picture in linear RGB, top row first, and hashes of the decisions behind each pixel.
+    """A picture in linear RGB, top row first, and a hash of the decisions behind each pixel.
 
-    Two renders of a scene have the same ``path`` in a pixel if all rays met the same objects in the same
-    order, and the same ``lights`` if at each of them the same lights were in front and in sight.
+    Two renders of a scene have the same one in a pixel if all rays met the same objects in the same order,
+    and at each of them the same lights were in front and in sight.
     """
 
     image: Array  # float64 [H, W, 3]
-    path: Array  # uint64 [H, W]
-    lights: Array  # uint64 [H, W]
+    decisions: Array  # uint64 [H, W]
 
 
 def reference_render(
@@ -88,18 +87,17 @@ def _radiance(
     clamp: bool = True,
     max_depth: int = 10,
     bounce_budget: str = "report",
-) -> tuple[Array, Array, Array]:
-    """The light [N, 3] that comes back along rays, and the hashes of their paths and lights [N]."""
+) -> tuple[Array, Array]:
+    """The light [N, 3] that comes back along rays, and the hashes of their decisions [N]."""
     things = objects(scene)
     materials = [thing.material for thing in things]
     numbers = np.array([*((m.ior, m.alpha, *m.specular) for m in materials), NOTHING])
     light = np.zeros(d.shape)
-    path, lights = np.zeros((2, len(d)), np.uint64)
+    decisions = np.zeros(len(d), np.uint64)
     rays = [np.arange(len(d)), np.ones(d.shape), np.zeros(len(d), int), o, d]
     while len(rays[0]):
         ray, weight, spent, o, d = rays
         t, thing, n, diffuse = nearest(things, o, d)  # where nothing is met, n = 0 faces no light
-        path[ray] = _mix(path[ray], thing)
         missed = thing < 0
         light[ray[missed]] += weight[missed] * scene.sky
         ior, alpha, *specular = numbers[thing].T
@@ -125,19 +123,16 @@ def _radiance(
             value = np.maximum(diffuse[lit] / math.pi + specular[lit] * lobe[:, None], 0)
             value = value * dot(n, to_light)[lit, None] * lamp.color
             light[ray[lit]] += weight[lit] * (np.clip(value, 0, 1) if clamp else value)
-        lights[ray] = _mix(lights[ray], seen)
+        # continued by two more numbers
+        hashed = (decisions[ray] * HASH ^ (thing + 2).astype(np.uint64)) * HASH
+        decisions[ray] = (hashed ^ seen.astype(np.uint64)) * HASH
 
         weight = weight * specular * reflectance(fresnel, cos, ior)[:, None]
         spent += 1 if bounce_budget == "plain" else np.maximum(1, 10 - (10 * ior).astype(int))
         on = (cos > 0) & (spent < max_depth) & (weight != 0).any(axis=1)
         d = unit(d + 2 * cos[:, None] * n)
         rays = [x[on] for x in (ray, weight, spent, start, d)]
-    return light, path, lights
-
-
-def _mix(hashed: Array, value: Array) -> Array:
-    """Continue hashes by one more number each."""
-    return (hashed * HASH ^ (value + 2).astype(np.uint64)) * HASH
+    return light, decisions
 
 
 def unit(v: Any) -> Array:

@@ -18,7 +18,7 @@ STEP = 1 / 255  # of an 8-bit picture: invisible
 # Pixels. Float32 places a ray to about 1e-5 of a pixel, and mirrors of small spheres enlarge that a hundred
 # times; where so small a move changes what a ray meets, float32 may meet the other
 DISPLACEMENT = 1e-3
-REASONS = ("silhouette", "shadow edge", "steep shading", "unexplained")
+REASONS = ("edge", "steep shading", "unexplained")
 # Bounds for 99 of 100 pixels of scenes 0 to 9, three times what was measured: what is left there is rounding
 # in mirrors and highlights, of alpha 1e-3 in scene 3, of balls in scene 4
 MOST = (5e-7, 1e-5, 1.5e-5, 3e-6, 3e-5, 1e-6, 6e-7, 5e-7, 3e-7, 9e-7)
@@ -30,9 +30,9 @@ def judge(
     """Judge a linear picture [H, W, 3] with one sample a pixel and the exact Fresnel factor.
 
     Return the error [H, W], the largest difference in a channel; and the reason [H, W], an index in
-    ``REASONS`` where the error exceeds a step of an 8-bit picture, else -1. Such a pixel is on a silhouette
-    or a shadow's edge if a ray moved by ``displacement`` pixels meets other things or other lights, on steep
-    shading if that changes its colour by as much, or unexplained.
+    ``REASONS`` where the error exceeds a step of an 8-bit picture, else -1. Such a pixel is on an edge, of a
+    silhouette or a shadow, if a ray moved by ``displacement`` pixels meets other things or other lights; on
+    steep shading if that changes its colour by as much; or unexplained.
     """
     size = {"height": image.shape[0], "width": image.shape[1]}
     truth = reference_render(scene, **size)
@@ -40,10 +40,9 @@ def judge(
     off = ~(error <= STEP)
     steps = [(displacement, 0), (-displacement, 0), (0, displacement), (0, -displacement)]
     moved = [reference_render(scene, displacement=step, **size) for step in steps if off.any()]
-    silhouette = np.any([other.path != truth.path for other in moved], axis=0)
-    shadow = np.any([other.lights != truth.lights for other in moved], axis=0)
+    edge = np.any([other.decisions != truth.decisions for other in moved], axis=0)
     spread = np.max([abs(other.image - truth.image).max(axis=-1) for other in moved], axis=0, initial=0)
-    return error, np.select([~off, silhouette, shadow, error <= spread], [-1, 0, 1, 2], 3)
+    return error, np.select([~off, edge, error <= spread], [-1, 0, 1], 2)
 
 
 def draw(scene: Scene | int, size: tuple[int, int], **integrator: Any) -> np.ndarray:
@@ -61,7 +60,7 @@ def hold(study: Study, number: int, error: np.ndarray, reason: np.ndarray) -> Va
         "median difference": (np.median(error), 1e-7, "least fault: half of the pixels off by 1e-7"),
         "difference of 99 %": (np.quantile(error, 0.99), MOST[number], least),
         "share of pixels off by > 1/255": (np.mean(error > STEP), 5e-4, edges),
-        "pixels off without a reason": (np.sum(reason == 3), 0, "reasons are found by rays that are moved"),
+        "pixels off without a reason": (np.sum(reason == 2), 0, "reasons are found by rays that are moved"),
     }
     for what, bound in found.items():
         study.at_most(f"scene {number}: {what}", *bound)
