@@ -12,10 +12,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cases import Cases, but_slow
-from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.scene.model import Scene
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation import cli
@@ -172,21 +170,14 @@ SMALL: dict[str, Any] = {"size": 32, "spp": 8, "renders": 32, "pairs": 2000}
 
 
 @pytest.mark.parametrize("distribution", ["beckmann", "ggx"])
-def test_comparison_finds_them_equal(tmp_path, distribution):
+def test_comparison_finds_them_equal(distribution):
     found = mrt.compare_roughconductor(alpha=0.2, distribution=distribution, **SMALL)
     assert found.equal
     assert 0 < found.errors["value"] < 2e-5
     assert found.errors["pixels that differ, with the same random numbers"] < 5e-3
     assert found.timings["ratio"] == pytest.approx(found.timings["ours"] / found.timings["theirs"])
     assert {image.shape for image in found.images.values()} == {(24, 32, 3)}
-    found.save(tmp_path / "both.exr")
-    exr = read_exr(tmp_path / "both.exr")
-    assert_array_equal(exr.image, found.images["ours"])
-    difference = exr.image - np.stack([exr.layers[f"theirs.{c}"] for c in "RGB"], axis=-1)
-    # the difference was taken in float64
-    assert_allclose(difference, found.images["difference"], atol=1e-6 * exr.image.max())
     assert "alpha = 0.2: equal" in str(found)
-    assert "alpha = 0.2: equal" in found._repr_html_()
 
 
 def test_comparison_sees_a_broken_bsdf(monkeypatch):

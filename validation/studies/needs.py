@@ -1,7 +1,6 @@
-"""What scenes do not need: rays, kernels, launches and seconds as planned, and where nothing is left out.
+"""What scenes do not need: rays, code of kernels and seconds as planned, and where nothing is left out.
 
-In three ways: as the plan has it; with all layers and the code that the plan leaves out of the kernels; and
-with that and as many rays in every pixel as edges get.
+Then all layers are made, by kernels with all code, from as many rays in every pixel as edges get.
 """
 
 from __future__ import annotations
@@ -27,27 +26,9 @@ if TYPE_CHECKING:
 
 TITLE = "What a scene does not need"
 SCENES = range(10)
-PLANNED = "as planned"
-GENERAL = "all code and layers"
-EVERYTHING = "all code, layers and rays"
-# By measure, the way that the plan is compared with: with all rays in every pixel, one pass replaces two
-MEASURES = {"rays": EVERYTHING, "operations": EVERYTHING, "launches": GENERAL, "seconds": EVERYTHING}
-
-TITLES = {
-    "rays": "rays",
-    "operations": "size of the tracing kernel, operations",
-    "launches": "launches of kernels",
-    "seconds": "time",
-}
-
-# By measure but for the time: the figure of a render
-FIGURES: dict[str, Callable[[Callable[..., Result]], float]] = {
-    "rays": lambda render: float(sum(render(count_rays=True).rays.values())),
-    "operations": lambda render: float(max(operations(render))),
-    "launches": lambda render: float(render().kernel_launches),
-}
-
+TITLES = {"rays": "rays", "operations": "size of the tracing kernel, operations", "seconds": "time"}
 REFINED: Values = {"progress": Progress(), "aa": 4, "aamode": "sobel", "lattice": "report"}
+EVERYTHING: Values = {"layers": "all", "aamode": "none"}
 
 
 def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
@@ -70,27 +51,23 @@ def scenes_of(number: int, size: tuple[int, int]) -> tuple[mi.Scene, mi.Scene]:
 
 
 def measure(number: int, size: tuple[int, int], repeats: int) -> Values:
-    """Return the row of a scene with edges refined: figures as planned, and factors of the other ways."""
+    """Return the row of a scene with edges refined: figures as planned, and how much more of each else."""
     planned, whole = scenes_of(number, size)
-    general_way = REFINED | {"layers": "all"}
-    renders = {
-        PLANNED: partial(mrt.render, planned, **REFINED),
-        GENERAL: partial(mrt.render, whole, **general_way),
-        EVERYTHING: partial(mrt.render, whole, **general_way | {"aamode": "none"}),
+    ways = (partial(mrt.render, planned, **REFINED), partial(mrt.render, whole, **REFINED | EVERYTHING))
+
+    def in_turn(render: Callable[..., Result], turn: int) -> Result:
+        return render()
+
+    turns = timed_in_turns([partial(in_turn, render) for render in ways], repeats)
+    figures = {
+        "rays": [sum(render(count_rays=True).rays.values()) for render in ways],
+        "operations": [max(operations(render)) for render in ways],
+        "seconds": [float(np.median(seconds)) for _, seconds in turns],
     }
-    own = {name: figure(renders[PLANNED]) for name, figure in FIGURES.items()}
-    others = {name: figure(renders[MEASURES[name]]) for name, figure in FIGURES.items()}
-
-    def render_by(way: str, turn: int) -> Result:
-        return renders[way]()
-
-    ways = (PLANNED, MEASURES["seconds"])
-    turns = timed_in_turns([partial(render_by, way) for way in ways], repeats)
-    own["seconds"], others["seconds"] = (float(np.median(seconds)) for _, seconds in turns)
-    times = {f"{name}: times as many": others[name] / own[name] for name in MEASURES}
-    (result, *_), _ = turns[0]
-    left_out = ", ".join(what for what, _ in result.plan.left_out if what not in LAYERS)
-    return {"scene": number, **own, **times, "left out": left_out}
+    row: Values = {"scene": number, **{name: own for name, (own, _) in figures.items()}}
+    row |= {f"{name}: times as many": other / own for name, (own, other) in figures.items()}
+    left_out = turns[0][0][0].plan.left_out
+    return row | {"left out": ", ".join(what for what, _ in left_out if what not in LAYERS)}
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -111,7 +88,7 @@ def show(study: Study, size: tuple[int, int], scenes: Sequence[int], repeats: in
             study.at_least(f"scene {number}: {name} without a plan / with it", times_as_many, 1, why)
     caption = (
         "Blue: as planned, with the figure itself on the left. Orange: where nothing is left out: all code "
-        "in the kernels, all layers, and (but for launches) as many rays in every pixel as edges get."
+        "in the kernels, all layers, and as many rays in every pixel as edges get."
     )
     for name, title in TITLES.items():
         study.picture(f"savings {name}", title, savings(name, rows), caption if name == "rays" else "")
