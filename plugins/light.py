@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -99,13 +98,15 @@ class MrtLight(mi.Emitter):
 
     # Dr.Jit calls these for scenes without such a light, too, if there is one elsewhere: they cannot refuse
 
-    def sample_ray(self, *_: Any) -> tuple[mi.Ray3f, mi.Spectrum]:
+    def sample_ray(self, *_: object) -> tuple[mi.Ray3f, mi.Spectrum]:
         return dr.zeros(mi.Ray3f), mi.Spectrum(0)
 
-    def sample_position(self, *_: Any) -> tuple[mi.PositionSample3f, mi.Float]:
+    def sample_position(self, *_: object) -> tuple[mi.PositionSample3f, mi.Float]:
         return dr.zeros(mi.PositionSample3f), mi.Float(0)
 
-    def sample_wavelengths(self, si: mi.SurfaceInteraction3f, *_: Any) -> tuple[mi.Wavelength, mi.Spectrum]:
+    def sample_wavelengths(
+        self, si: mi.SurfaceInteraction3f, *_: object
+    ) -> tuple[mi.Wavelength, mi.Spectrum]:
         return si.wavelengths, mi.Spectrum(0)
 
     def bbox(self) -> mi.ScalarBoundingBox3f:

@@ -23,6 +23,9 @@ MIN_MESH_EXTENT = 1e-8
 MAX_MESH_COORDINATE = 1e10
 
 
+Facts = dict[str, Any]  # some of ``SceneFacts``, by name
+
+
 class Reading:
     """A snapshot of a scene and the facts in it; ``cache`` holds those of parts that have not changed since.
 
@@ -56,7 +59,7 @@ class Reading:
             differentiated=any(part.differentiated for part in (shapes, materials, lights)),
         )
 
-    def _read_shapes(self) -> dict[str, Any]:
+    def _read_shapes(self) -> Facts:
         """Return the facts about the shapes."""
         meshes = [s for s in (*self.native, *self.snapshot.inner) if s.is_mesh()]
         for mesh in meshes:
@@ -90,7 +93,7 @@ def _check_size(mesh: mi.Mesh) -> None:
 
 def _read_lights(
     snapshot: Snapshot,
-) -> tuple[list[mi.Emitter], list[list[list[float]]] | None, dict[str, Any]]:
+) -> tuple[list[mi.Emitter], list[list[list[float]]] | None, Facts]:
     """Return the lights, their rows where all have some, and the facts about them."""
     largest = {id(e): brightness(e) for e in snapshot.emitters}
     lights = [e for e in snapshot.emitters if not e.is_environment() and largest[id(e)] != 0]
@@ -110,7 +113,7 @@ def _read_lights(
     return lights, rows, facts
 
 
-def _read_materials(snapshot: Snapshot) -> tuple[list[np.ndarray], dict[str, Any]]:
+def _read_materials(snapshot: Snapshot) -> tuple[list[np.ndarray], Facts]:
     """Return the materials as rows of a table, none where they have no place in one, and the facts."""
     bsdfs = snapshot.bsdfs
     rows, merge_obstacle = material_rows(snapshot.shapes)

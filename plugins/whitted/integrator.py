@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -58,7 +58,7 @@ class Path:
     bounces: mi.UInt32  # mirror rays traced
     shadow_rays: mi.UInt32  # shadow rays traced
     active: mi.Bool  # paths that go on
-    sampler: Any  # None where all lights are points
+    sampler: mi.Sampler  # None where all lights are points
 
 
 @dataclass
@@ -67,7 +67,7 @@ class Sums:
 
     radiance: mi.UnpolarizedSpectrum
     shadow_rays: mi.UInt32
-    sampler: Any  # None where all lights are points
+    sampler: mi.Sampler  # None where all lights are points
 
 
 class MrtWhitted(mi.SamplingIntegrator):
@@ -125,7 +125,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         if props.get("hide_emitters", False):
             raise ParameterError('mrt_whitted: "hide_emitters" is not accepted; take away the lamp\'s shape')
         self.max_depth = integer(props, "max_depth", 10, least=1, most=2**32 - 1)
-        self.sky: Any = spectrum(props, "sky", emissive=True) if "sky" in props else None
+        self.sky: mi.Texture = spectrum(props, "sky", emissive=True) if "sky" in props else None
         self.clamp = flag(props, "clamp", True)
         self.min_contribution = number(props, "min_contribution", MIN_CONTRIBUTION, least=0)
         self.bounce_budget = choice(props, "bounce_budget", BUDGETS)
@@ -324,7 +324,7 @@ class MrtWhitted(mi.SamplingIntegrator):
         data: SceneData,
         hit: Hit,
         throughput: mi.UnpolarizedSpectrum,
-        lights: Sequence[Any],
+        lights: Sequence[int | mi.UInt32],
         sums: Sums,
         *,
         mirror: bool,

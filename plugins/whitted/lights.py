@@ -55,7 +55,7 @@ class Lights:
             self.rows = [[dr.opaque(mi.Vector3f, part) for part in row] for row in rows]
 
     def sample(
-        self, light: Any, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
+        self, light: int | mi.UInt32, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.UnpolarizedSpectrum]:
         """Return the direction from ``it`` to light number ``light``, and the light that arrives."""
         if self.called is not None:

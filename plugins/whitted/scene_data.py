@@ -88,7 +88,7 @@ class SceneData:
         self.ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
         self.ray_flags |= +mi.RayFlags.dPdUV if plan.tangents else 0
 
-    def arrays(self) -> list[Any] | None:
+    def arrays(self) -> list[object] | None:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
         plan = self.plan
         sky = self.environment
@@ -141,7 +141,9 @@ class SceneData:
         si.wavelengths = ray.wavelengths
         return Hit(si, found, self.errors.bound(si, scale, found))
 
-    def occluded(self, hit: Hit, light: Any, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Bool:
+    def occluded(
+        self, hit: Hit, light: int | mi.UInt32, ds: mi.DirectionSample3f, active: mi.Bool
+    ) -> mi.Bool:
         """True if anything blocks the segment from ``hit`` to the sample ``ds`` of a light."""
         o = self._off_surface(hit, ds.d)
         to_light = ds.p - o
@@ -234,7 +236,9 @@ def _lights(reading: Reading, plan: KernelPlan) -> Lights:
     return Lights(reading.lights, reading.light_rows, plan.lights)
 
 
-def _light_buffers(reading: Reading, plan: KernelPlan, traced: Traced) -> list[tuple[PointBuffer, Any]]:
+def _light_buffers(
+    reading: Reading, plan: KernelPlan, traced: Traced
+) -> list[tuple[PointBuffer, Quadrics | Spheres]]:
     """Return lists of the objects that may block each light, with the objects, which test rays."""
     if not plan.light_buffers:
         return []
@@ -258,7 +262,7 @@ def _material_table(reading: Reading, plan: KernelPlan) -> MaterialTable | None:
     return MaterialTable(reading.snapshot.shapes, reading.materials) if plan.merged else None
 
 
-def _path_bound(facts: SceneFacts, plan: KernelPlan) -> Any:
+def _path_bound(facts: SceneFacts, plan: KernelPlan) -> float | mi.Float:
     """Return the bound of what a path may still bring, as data: a brighter sky needs no new kernel."""
     bound = plan.contribution_bounds[0]
     fixed = bound in (0, math.inf, facts.lights + 1)
@@ -279,7 +283,7 @@ def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:
 def _eval_bsdf(
     mirror: bool,
     context: mi.BSDFContext,
-    bsdf: Any,
+    bsdf: mi.BSDF | MaterialTable | None,
     si: mi.SurfaceInteraction3f,
     wos: list[mi.Vector3f],
     facing: list[mi.Bool],
@@ -309,7 +313,7 @@ def _eval_bsdf(
     return values, reflectance, int_ior
 
 
-def _ray_arrays(scene: mi.Scene) -> list[Any]:
+def _ray_arrays(scene: mi.Scene) -> list[object]:
     """Return the arrays of a scene that Embree's queries read; elsewhere, the scene.
 
     To see a scene, Dr.Jit looks at all objects of all scenes, which takes 20 µs for each.
@@ -319,13 +323,13 @@ def _ray_arrays(scene: mi.Scene) -> list[Any]:
     with dr.scoped_set_flag(dr.JitFlag.EnableObjectTraversal):
         indices = dr.detail.collect_indices(scene)
     handle = mi.UInt64(0)
-    arrays: list[Any] = dr.detail.update_indices([handle, handle, handle, mi.UInt32(0)], indices[:4])
+    arrays: list[mi.UInt32] = dr.detail.update_indices([handle, handle, handle, mi.UInt32(0)], indices[:4])
     expected = dr.reinterpret_array(mi.UInt32, scene.shapes_dr())
     known = np.array_equal(np.sort(arrays[-1]), np.sort(expected))
     return arrays if known else [scene]  # fields may come in another order
 
 
-def _arrays_in(value: Any) -> list[Any]:
+def _arrays_in(value: object) -> list[Any]:
     """Return the arrays in a value, with those inside containers and objects of this package."""
     if isinstance(value, type):
         return []

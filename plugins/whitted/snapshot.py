@@ -40,7 +40,7 @@ class Updates:
         self._count = self._forgotten = 0
         self._last: dict[int, int] = {}
 
-    def note(self, thing: Any) -> None:
+    def note(self, thing: mi.Object) -> None:
         """Record that an object was updated."""
         if len(self._last) >= MAX_TRACKED:  # from now on all look as if they had been updated
             self._forgotten = self._count = self._count + 1
@@ -48,7 +48,7 @@ class Updates:
         self._count += 1
         self._last[id(thing)] = self._count
 
-    def of(self, thing: Any) -> int:
+    def of(self, thing: mi.Object | None) -> int:
         """Return a number that differs from earlier ones if the object was updated since."""
         return self._last.get(id(thing), self._forgotten)
 
@@ -60,14 +60,14 @@ updates = Updates()
 class SnapshotPart:
     """Some objects with their textures and the like, as they are; equal to itself only."""
 
-    state: list[Any] = field(default_factory=list)  # what is compared
+    state: list[object] = field(default_factory=list)  # what is compared
     comparable: bool = True  # equal states mean that nothing has changed
     known: bool = True  # Mitsuba or this project has the classes of all objects
     differentiated: bool = False  # are derivatives wanted
-    _held: dict[int, Any] = field(default_factory=dict)  # objects, by id
-    _arrays: list[Any] = field(default_factory=list)
+    _held: dict[int, object] = field(default_factory=dict)  # objects, by id
+    _arrays: list[dr.ArrayBase] = field(default_factory=list)
 
-    def add(self, thing: Any, elsewhere: tuple[type, ...], *facts: Any) -> None:
+    def add(self, thing: mi.Object | None, elsewhere: tuple[type, ...], *facts: object) -> None:
         """Add an object and what it holds, but for objects of the classes that belong ``elsewhere``."""
         self.state += [id(thing), updates.of(thing), *facts]
         if thing is None or id(thing) in self._held:
@@ -178,7 +178,7 @@ def _eye(scene: mi.Scene) -> tuple[float, ...] | None:
     return tuple(place) if len(place) == 3 and np.isfinite(place).all() else None
 
 
-def parameters_of(thing: Any) -> list[tuple[str, Any, Any]]:
+def parameters_of(thing: mi.Object) -> list[tuple[str, Any, Any]]:
     """Return the parameters of one object: name, value, and how ``mi.get_property`` reads it, or None."""
     found = _collector(mi.variant())()
     found.entries = []
@@ -187,11 +187,11 @@ def parameters_of(thing: Any) -> list[tuple[str, Any, Any]]:
 
 
 @cache
-def _collector(variant: str) -> Any:
+def _collector(variant: str) -> type[mi.TraversalCallback]:
     """Return the class of what collects parameters, for a variant: there is none before one is chosen."""
 
     class Collector(mi.TraversalCallback):
-        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
+        def put(self, name: str, value: object, flags: int, cpptype: type | None = None) -> None:
             self.entries.append((name, value, cpptype))
 
     return Collector

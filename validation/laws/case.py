@@ -59,17 +59,17 @@ class Case:
             self.name = class_name(given)
             self.plugin = given
 
-    def with_(self, **changes: Any) -> Description:
+    def with_(self, **changes: object) -> Description:
         """The dict with other values of some parameters. Raises ``Skip`` without one."""
         if self.description is None:
             raise Skip("a loaded object was given: this needs the dict that it is made from")
         return {**self.description, **_kept(changes)}
 
-    def load(self, **changes: Any) -> mi.Object:
+    def load(self, **changes: object) -> mi.Object:
         """Load it in the current variant, with other values of some parameters. Raises ``Skip`` as well."""
         return mi.load_dict(_made(self.with_(**changes)))
 
-    def scene(self, **changes: Any) -> mi.Scene:
+    def scene(self, **changes: object) -> mi.Scene:
         """Load a scene that holds the shape alone, or an instance with its group. Raises ``Skip`` as well."""
         given = self.with_(**changes)
         nodes = {"shape": given}
@@ -94,7 +94,7 @@ class Case:
         """The first of some lanes."""
         return lanes[: self.count(quick, full)]
 
-    def program(self, body: str, **names: Any) -> str:
+    def program(self, body: str, **names: object) -> str:
         """A program that loads the plugin and runs ``body``, formatted with ``names``."""
         setups = [setup for name, setup in _SETUP.items() if names.get(name) is not None]
         text = "".join(setups) + "\n" + body

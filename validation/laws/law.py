@@ -194,7 +194,7 @@ class Outcome:
         *,
         where: ArrayLike = True,
         limit: float | None = None,
-        **names: Any,
+        **names: object,
     ) -> None:
         """Compare a number, or N errors, with the limit of a criterion.
 

@@ -101,7 +101,7 @@ def at_wavelengths(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     return si
 
 
-def _fits(value: Any, kind: str) -> bool:
+def _fits(value: object, kind: str) -> bool:
     """Whether Mitsuba takes a value for a type of the current variant."""
     if kind not in ("Spectrum", "Float"):
         return isinstance(value, getattr(mi, kind))
@@ -112,7 +112,7 @@ def _fits(value: Any, kind: str) -> bool:
     )
 
 
-def _cast(value: Any, kind: str) -> Any:
+def _cast(value: object, kind: str) -> Any:
     """Return a value as Mitsuba converts it: a number also counts as a color."""
     wanted = getattr(mi, kind)
     return value if isinstance(value, wanted) else wanted(value)
@@ -124,7 +124,7 @@ def method(plugin: mi.Object, name: str) -> Call:
     It raises ``TypeError`` where the plugin returns another type.
     """
 
-    def call(*given: Any, active: Any = True) -> Any:
+    def call(*given: object, active: mi.Bool = True) -> Any:
         answer = getattr(plugin, name)(*given, mi.Bool(active))
         kinds = RETURNS[name]
         parts = answer if isinstance(answer, tuple | list) else (answer,)
@@ -153,7 +153,7 @@ class Probe:
         wi = np.broadcast_to(at.wi, (count, 3))
         uv = np.broadcast_to(at.uv, (count, 2))
 
-        def values(i: mi.Vector3f, t: mi.Point2f, o: mi.Vector3f) -> Any:
+        def values(i: mi.Vector3f, t: mi.Point2f, o: mi.Vector3f) -> object:
             return call(ctx or context(), interaction(i, t), o)
 
         return lanes(values, ("Vector3f", wi), ("Point2f", uv), ("Vector3f", third))
@@ -172,7 +172,7 @@ class Probe:
         value = method(self.plugin, "eval")
         density = method(self.plugin, "pdf")
 
-        def values(*given: Any) -> list[mi.Spectrum]:
+        def values(*given: object) -> list[mi.Spectrum]:
             return [value(*given), density(*given)]
 
         return self.ask(values, at, ctx)
@@ -191,7 +191,7 @@ class Probe:
 
         sample = method(self.plugin, "sample")
 
-        def call(c: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Vector3f) -> Sequence[Any]:
+        def call(c: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Vector3f) -> list[object]:
             bs, weight = sample(c, si, u.x, mi.Point2f(u.y, u.z))
             return [bs.wo, bs.pdf, bs.eta, bs.sampled_type, bs.sampled_component, weight]
 
@@ -254,7 +254,7 @@ def lanes(call: Call, *columns: tuple[str, Array]) -> list[Array]:
     return arrays
 
 
-def _values(call: Call, arguments: Sequence[Any]) -> list[Any]:
+def _values(call: Call, arguments: Sequence[object]) -> list[Any]:
     """The values of a call; those of polarized light are the intensity."""
     values = call(*arguments)
     several = values if isinstance(values, list | tuple) else [values]
