@@ -313,7 +313,6 @@ def test_each_figure_of_an_emitter_has_a_specimen():
     known = {f"{fault.law}.{fault.criterion}" for fault in power.KINDS["emitter"].faults}
     known |= {
         "sampling.place",
-        "sampling.counts",
         "sampling.slices",
         "weights.seen",
         "finite.bad",

@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.linalg import norm
-from scipy import stats
 
 from . import probe
 from .case import READS, READS_WHY, Case, Given, judge_many, reads_checked
@@ -27,7 +26,6 @@ from .law import (
     most,
     number_of,
     p_value,
-    sidak,
 )
 from .page import Check
 from .probe import BEYOND, Array, Lanes, excess, lanes, method
@@ -36,10 +34,8 @@ from .sphere import (
     SMALL_CELL_LEVEL,
     Cells,
     chances_of,
-    chi_square,
     encode,
     hold_small,
-    integrate,
     p_value_of_least,
 )
 
@@ -302,8 +298,7 @@ def no_density_of_sample(size, ds, u):
         "one place, said in two ways",
         SAMPLED,
     ),
-    counts=p_value("smallest p-value of a chi-square test of directions, corrected for their number"),
-    small=p_value("smallest p-value of counts in cells of one degree, corrected for their number"),
+    small=p_value("smallest p-value of counts in small cells, corrected for their number"),
     slices=p_value("smallest p-value of counts in slices of one or two degrees, corrected for their number"),
     light=most(
         "light of a lamp by samples against by rays in all directions, relative, beyond "
@@ -318,7 +313,7 @@ def no_density_of_sample(size, ds, u):
     ),
 )
 def sampling(law: Outcome, case: EmitterCase) -> None:
-    """p = o + dist · d; directions to light from all around follow their density (Pearson's χ²)."""
+    """p = o + dist · d; directions to light from all around follow their density."""
     s = case.samples
     if not s.lit.any():
         raise Skip("no sample carries light")
@@ -330,21 +325,11 @@ def sampling(law: Outcome, case: EmitterCase) -> None:
         law.check("light", _by_samples_and_by_rays(case))
     if not case.around:
         return
-    count = 2**12 if probe.is_scalar() else 2**18
-    codes = encode(case.sample(np.repeat(case.points[:1], count, axis=0)).d)
-    pilot = codes[: count // 4]
-    codes = codes[count // 4 :]
-    cells = Cells.around(pilot, max(len(pilot) // 1000, 8))
-    integrals = integrate(case.density, cells, case.rng, codes, len(codes))
-    tests, _ = chi_square(integrals, codes, len(codes))
-    chances = stats.chi2.sf(*tests.T)
-    law.check("counts", sidak(chances.min(), len(chances)))
     rng = np.random.default_rng((case.seed, 2))
     anywhere = probe.unit(rng.normal(size=(case.count(2**18, 2**20), 3)))
     pdf, value = case.seen(anywhere)
     law.check("dark", probe.without_density(value, pdf))
-    if not probe.is_scalar():
-        _in_small_cells(law, case)
+    _in_small_cells(law, case)
 
 
 def _by_samples_and_by_rays(case: EmitterCase) -> float:
@@ -364,13 +349,14 @@ def _by_samples_and_by_rays(case: EmitterCase) -> float:
 
 
 def _in_small_cells(law: Outcome, case: EmitterCase) -> None:
-    """Directions in cells of a degree and in slices, for places that are never sampled."""
-    count = case.count(2**21, 2**23)
-    cells = Cells.uniform(SMALL_CELL_LEVEL)
+    """Directions in cells and in slices of a degree, coarser in scalar variants: for places never sampled."""
+    count = 2**12 if probe.is_scalar() else case.count(2**21, 2**23)
+    cells = Cells.uniform(3 if probe.is_scalar() else SMALL_CELL_LEVEL)
     rng = np.random.default_rng((case.seed, 3))
     seen = np.zeros(len(cells.start))
-    for _ in range(count // 2**20):
-        seen += cells.counts(encode(_directions(case, rng.random((2**20, 2), np.float32))))
+    wave = min(count, 2**20)
+    for _ in range(count // wave):
+        seen += cells.counts(encode(_directions(case, rng.random((wave, 2), np.float32))))
     counts = np.array([seen, *cells.expected(case.density, count, rng)])
     # a corner of a bright texel may lie between the points of a cell
     (doubtful,) = np.nonzero(chances_of(counts, REEVALUATION_TOL) < RETRY_P_VALUE)
