@@ -33,8 +33,6 @@ PICTURE = "newmtl m\nKd 1 1 1\nmap_Kd p.png\n"
 WHITE = base64.b64decode(  # one pixel
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4//8/AAX+Av4N70a4AAAAAElFTkSuQmCC"
 )
-SPECTRUM = """<shape type='sphere'><bsdf type='diffuse'><spectrum name='reflectance' filename='s.spd'/></bsdf>
-</shape>"""
 
 
 def xml(inside: str, sensor: str = SMALL) -> dict[str, Content]:

@@ -161,9 +161,6 @@ def test_small_mistakes_are_seen():
     assert not verdict(1, bounce_budget="plain", max_depth=1).passed
 
 
-# -------------------------------------- What studies are made of --------------------------------------
-
-
 # ---------------------------------------- compare_roughconductor ----------------------------------------
 
 SMALL: dict[str, Any] = {"size": 32, "spp": 8, "renders": 32, "pairs": 2000}
