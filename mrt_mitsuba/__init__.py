@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mrt_mitsuba.rendering.api import render as render
     from mrt_mitsuba.rendering.prepare import prepare as prepare
     from mrt_mitsuba.runtime import register as register
-    from mrt_mitsuba.scene.export import scene_dict as scene_dict
+    from mrt_mitsuba.scene.report import scene_dict as scene_dict
     from mrt_mitsuba.sweeps import sweep as sweep
     from mrt_mitsuba.validation.check import check_bsdf as check_bsdf
     from mrt_mitsuba.validation.check import check_emitter as check_emitter
@@ -44,7 +44,7 @@ _HOME = {
     "prepare": "mrt_mitsuba.rendering.prepare",
     "register": "mrt_mitsuba.runtime",
     "render": "mrt_mitsuba.rendering.api",
-    "scene_dict": "mrt_mitsuba.scene.export",
+    "scene_dict": "mrt_mitsuba.scene.report",
     "sweep": "mrt_mitsuba.sweeps.run",
 }
 __all__ = ["MrtError", "MrtWarning", "OutputError", "SceneError", "UsageError", "VariantError"]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from mrt_mitsuba.scene.export import FLAVORS, write_xml
+from mrt_mitsuba.scene.export import write_xml
+from mrt_mitsuba.scene.model import FLAVORS
 from mrt_mitsuba.scenes_xml import NUMBERS, path
 
 for number in NUMBERS:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mrt_mitsuba.adaptive.estimate import SampleStatistics
-from mrt_mitsuba.filters.denoise import Denoised, denoise
+from mrt_mitsuba.filters.denoising import Denoised, denoise
 
 DENOISING_SPP = 12  # cost of denoising the two halves, in samples per pixel
 EXPECTED_RATIO = 0.4  # of the mixture's error to the plain one, before it is measured

@@ -29,7 +29,7 @@ from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
 from mrt_mitsuba.adaptive.tails import PARETO_K_THRESHOLD
 from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import warn
-from mrt_mitsuba.filters.denoise import Denoised
+from mrt_mitsuba.filters.denoising import Denoised
 from mrt_mitsuba.plugins import plugin
 from mrt_mitsuba.rendering.exposing import Exposer, RayBatch, film_samples
 from mrt_mitsuba.rendering.progress import Advance

@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 
 import mitsuba as mi
 
-from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
 from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import UsageError, needs_extra
 from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
@@ -121,6 +120,8 @@ class Rounds(Pass):
     rmse: float | None = None  #: that the target has come to; None until a round has been traced
 
     def __str__(self) -> str:
+        from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
+
         goal = self.goal
         metric = METRICS[goal.metric]
         kind = "an error" if metric is LINEAR else f"a {metric.name} error"

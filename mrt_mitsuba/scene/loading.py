@@ -29,7 +29,6 @@ from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home
 from mrt_mitsuba.options import Values
-from mrt_mitsuba.scene.files import require_file
 
 MAX_DEPTH = 256  # maximum levels of nesting of a dict; Mitsuba overflows its stack from some thousands on
 MAX_SAMPLE_COUNT = 2**24  # maximum spp; some samplers divide by zero at 0, or never end at 2^31
@@ -82,6 +81,8 @@ def load_file(
     Raises ``SceneError``, and ``UsageError`` for another kind of file, a parameter or key that is not in it,
     or a texture too large for the budget.
     """
+    from mrt_mitsuba.scene.files import require_file
+
     require_file(path)
     if not path.lower().endswith(".xml"):
         raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
@@ -257,6 +258,8 @@ def _check_data(filename: str, inputs: set[str]) -> str:
     missing file."""
     path = _resolved(filename) if filename else ""
     if os.path.exists(path):
+        from mrt_mitsuba.scene.files import require_file
+
         require_file(path)
     inputs.add(path)
     return path

@@ -1,7 +1,7 @@
 """A scene in the report's terms, and its translation to a Mitsuba dict.
 
 Lengths are in scene units, colours are linear RGB. ``Scene.to_dict()`` gives the plugins of this project,
-``export.scene_dict`` also the nearest equivalents among Mitsuba's own.
+``report.scene_dict`` also the nearest equivalents among Mitsuba's own.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ SIZE = (800, 600)  # default image size in pixels, for scenes without a film
 SIDE = integer(1, 65536)  # image side in pixels; whether the memory suffices is checked later
 FRESNEL = choice("schlick", "dielectric")
 CONVENTION = choice("report", "standard")  # of MTL files, and of how textures are looked up
+FLAVORS = ("mrt", "stock")  # this project's plugins, or Mitsuba's own
 MAX_FLOAT = 3.4e38  # largest float32
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
 # Options that apply to OBJ files only

@@ -14,7 +14,22 @@ from pathlib import Path
 from typing import Any
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Mesh, Plane, Scene, Sphere
+from mrt_mitsuba.options import check, choice
+from mrt_mitsuba.scene.model import (
+    FLAVORS,
+    FRESNEL,
+    SIDE,
+    Camera,
+    Cone,
+    Cylinder,
+    Light,
+    Material,
+    Mesh,
+    Node,
+    Plane,
+    Scene,
+    Sphere,
+)
 
 NUMBERS = tuple(range(10))
 _ASSETS = Path(__file__).parent / "assets"
@@ -26,6 +41,35 @@ def report_scene(number: int) -> Scene:
     if number not in NUMBERS:
         raise UsageError(f"there is no scene {number!r}: choose one of {', '.join(map(str, NUMBERS))}")
     return _read(number)
+
+
+def scene_dict(
+    scene: int | Scene, *, width: int = 800, height: int = 600, fresnel: str = "schlick", flavor: str = "mrt"
+) -> Node:
+    """Return a scene as a plain Mitsuba dict; ``mi.load_dict`` takes it (after ``mrt.register()``).
+
+    ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
+    any Mitsuba program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's
+    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap`` for a
+    texture, and ``path`` with few bounces. Cones and meshes have one in files only: see ``export.write_xml``.
+
+    Raises ``UsageError`` for an unknown scene, flavor or formula and for a size out of range, ``SceneError``
+    for a scene without a stock flavor.
+    """
+    check("flavor", choice(*FLAVORS), flavor)
+    width = check("width", SIDE, width)
+    height = check("height", SIDE, height)
+    fresnel = check("fresnel", FRESNEL, fresnel)
+    from mrt_mitsuba import runtime
+
+    runtime.use()
+    terms = scene if isinstance(scene, Scene) else report_scene(scene)
+    result = terms.to_dict(width=width, height=height, fresnel=fresnel)
+    if flavor == "mrt":
+        return result
+    from mrt_mitsuba.scene.stock import stock
+
+    return stock(result, terms)
 
 
 @cache

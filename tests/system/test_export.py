@@ -13,8 +13,8 @@ from PIL import Image
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
-from mrt_mitsuba.scene.export import FLAVORS, write_xml
-from mrt_mitsuba.scene.model import Camera, Cylinder
+from mrt_mitsuba.scene.export import write_xml
+from mrt_mitsuba.scene.model import FLAVORS, Camera, Cylinder
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.scenes_xml import NUMBERS, path
 

@@ -67,7 +67,7 @@ def test_the_error_of_a_known_denoiser(monkeypatch):
     def halved(color, *features):
         return ((color + SMOOTH) / 2).astype(np.float32)
 
-    monkeypatch.setattr(sys.modules["mrt_mitsuba.filters.denoise"], "_open_image_denoise", halved)
+    monkeypatch.setattr(sys.modules["mrt_mitsuba.filters.denoising"], "_open_image_denoise", halved)
     found = filters.denoise(noisy(SMOOTH, 0, 0.02), noisy(SMOOTH, 1, 0.02))
     assert found.weight.min() > 0.99
     assert found.rmse == pytest.approx(rms(found.image - SMOOTH), rel=0.03)
