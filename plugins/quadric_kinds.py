@@ -143,9 +143,9 @@ class Axial:
         r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
         x, y = _azimuth(q, r)
         side = part == LATERAL
-        on_base = True if TOP not in self.parts else part == BASE
+        on_base = part == BASE
         # The distance to the part, linear along its gradient
-        off_disc = q.z - 1 if on_base is True else dr.select(on_base, q.z - 1, -q.z)
+        off_disc = dr.select(on_base, q.z - 1, -q.z)
         off_side = r - q.z if self.slope else r - 1
         up = dr.select(side, -self.slope, dr.select(on_base, 1, -1))
         gradient = type(q)([dr.select(side, x, 0), dr.select(side, y, 0), up])

@@ -28,7 +28,6 @@ class Plugin:
     #: the table of the kernels of ``mrt_whitted`` that its numbers go into: "lights", "materials", "planes",
     #: "quadrics", or "" for none
     table: str = ""
-    outside: str = ""  #: why it has no place in one
 
 
 PLUGINS = (
@@ -79,7 +78,6 @@ PLUGINS = (
             "positions": np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]]], np.float32),
             "faces": np.array([[[0, 1, 2]]], np.uint32),
         },
-        outside="Mitsuba traces triangles",
     ),
     Plugin(
         name="mrt_plane",
@@ -95,14 +93,12 @@ PLUGINS = (
         class_name="MrtTexture",
         kind="texture",
         sample={"bitmap": np.full((2, 2, 3), 0.5, np.float32)},
-        outside="it varies over a surface",
     ),
     Plugin(
         name="mrt_whitted",
         module="whitted.integrator",
         class_name="MrtWhitted",
         kind="integrator",
-        outside="it traces them",
     ),
 )
 
