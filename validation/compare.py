@@ -55,7 +55,7 @@ class Difference:
     rmse: float  #: root of the mean squared error
     rel_mse: float  #: mean of (a − b)² / (b² + 0.01)
     display: float  #: RMSE of sRGB values clipped to [0, 1], as on a screen; a grey level is 1/255
-    psnr: float  #: peak signal-to-noise ratio in dB
+    psnr: float  #: peak signal-to-noise ratio in dB, for a peak of 1
     largest: float  #: largest absolute error of a channel
     place: tuple[int, int]  #: row and column of the largest error
     p_value: float | None  #: of as much difference by noise alone; None where no noise is known
@@ -124,13 +124,12 @@ class Difference:
         return f"<pre>{html.escape(str(self))}</pre>"
 
 
-def compare(a: Picture, b: Picture, layer: str = "", *, peak: float = 1.0) -> Difference:
+def compare(a: Picture, b: Picture, layer: str = "") -> Difference:
     """Compare a picture with a reference.
 
     Args:
         a, b: each the path of an EXR, an array [H, W] or [H, W, C], or the result of ``render``.
         layer: of an EXR or a result ("depth"), or one channel of it ("depth.Z"); by default the picture.
-        peak: brightest value, for the PSNR.
 
     The p-value needs a layer "error", the standard error of each pixel, next to the picture, as
     ``render(target=...)`` and ``aamode="noise"`` write it, whatever the film's filter.
@@ -150,7 +149,7 @@ def compare(a: Picture, b: Picture, layer: str = "", *, peak: float = 1.0) -> Di
         size = abs(difference)
         square = difference**2
         relative = np.where(np.isinf(square), np.inf, square / (second**2 + EPSILON))
-        psnr = 20 * np.log10(peak) - 10 * np.log10(square.mean())
+        psnr = -10 * np.log10(square.mean())
     return Difference(
         mae=float(size.mean()),
         rmse=float(square.mean() ** 0.5),

@@ -55,10 +55,8 @@ def error_against_time() -> Answer:
     """All that a user can choose, in the report's scenes and Mitsuba's."""
     scenes = (0,) if pages.QUICK else (0, 1, 2, 3, 4, "Cornell box")
     panels: dict[str, work_precision.Findings] = {}
+    cost = error_vs_time.QUICK if pages.QUICK else error_vs_time.DOCS
     for scene in scenes:
-        cost = (
-            error_vs_time.QUICK if pages.QUICK else error_vs_time.shown(scene)
-        )
         panels |= error_vs_time.choices(scene, cost)
     plots = [
         work_precision.diagram(title, found)

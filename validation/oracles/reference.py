@@ -5,7 +5,6 @@ other forms where there are any, and the geometry is its own. Slow, and small en
 
 * Walter et al. 2007, "Microfacet models for refraction through rough surfaces": D (eq. 25), G₁ (eq. 27), and
   the Fresnel reflectance in Cook and Torrance's form (eq. 22).
-* Schlick 1994, "An inexpensive BRDF model for physically-based rendering": eq. 15.
 """
 
 from __future__ import annotations
@@ -44,13 +43,19 @@ class ReferenceResult(NamedTuple):
 
 
 def reference_render(
-    scene: Scene, *, width: int, height: int, displacement: Sequence[float] = (0, 0), **settings: Any
+    scene: Scene,
+    *,
+    width: int,
+    height: int,
+    displacement: Sequence[float] = (0, 0),
+    fresnel: str = "dielectric",
+    clamp: bool = True,
 ) -> ReferenceResult:
     """Render a scene with one ray through each pixel, exactly to the rounding of float64.
 
-    ``displacement``: of the rays, in pixels, y upwards. ``settings``: ``fresnel`` ("dielectric", "schlick" or
-    "unity"), ``clamp``, ``max_depth`` and ``bounce_budget`` ("report" or "plain"). Raises ``SceneError`` for
-    a texture on anything but triangles, and for one that is not looked up as in the report.
+    ``displacement``: of the rays, in pixels, y upwards. ``fresnel``: "dielectric" or "unity". ``clamp``: each
+    light's part to [0, 1], as the report does. Raises ``SceneError`` for a texture on anything but triangles,
+    and for one that is not looked up as in the report.
     """
     camera = scene.camera
     textured = [thing for thing in objects(scene) if thing.material.texture]
@@ -68,7 +73,7 @@ def reference_render(
     v = (2 * y - height) / width * half_width
     d = unit(forward + u[:, None] * right + v[:, None] * np.cross(forward, right))
     o = np.broadcast_to(np.array(camera.position, float), d.shape)
-    layers = _radiance(scene, o, d, **settings)
+    layers = _radiance(scene, o, d, fresnel, clamp)
     return ReferenceResult(*(layer.reshape(height, width, *layer.shape[1:])[::-1] for layer in layers))
 
 
@@ -78,16 +83,7 @@ def objects(scene: Scene) -> list[Any]:
 
 
 @np.errstate(all="ignore")
-def _radiance(
-    scene: Scene,
-    o: Array,
-    d: Array,
-    *,
-    fresnel: str = "dielectric",
-    clamp: bool = True,
-    max_depth: int = 10,
-    bounce_budget: str = "report",
-) -> tuple[Array, Array]:
+def _radiance(scene: Scene, o: Array, d: Array, fresnel: str, clamp: bool) -> tuple[Array, Array]:
     """The light [N, 3] that comes back along rays, and the hashes of their decisions [N]."""
     things = objects(scene)
     materials = [thing.material for thing in things]
@@ -128,8 +124,8 @@ def _radiance(
         decisions[ray] = (hashed ^ seen.astype(np.uint64)) * HASH
 
         weight = weight * specular * reflectance(fresnel, cos, ior)[:, None]
-        spent += 1 if bounce_budget == "plain" else np.maximum(1, 10 - (10 * ior).astype(int))
-        on = (cos > 0) & (spent < max_depth) & (weight != 0).any(axis=1)
+        spent += np.maximum(1, 10 - (10 * ior).astype(int))  # the report's budget of bounces
+        on = (cos > 0) & (spent < 10) & (weight != 0).any(axis=1)
         d = unit(d + 2 * cos[:, None] * n)
         rays = [x[on] for x in (ray, weight, spent, start, d)]
     return light, decisions
@@ -152,9 +148,6 @@ def reflectance(form: str, cos: Array, ior: Array) -> Array:
     """Fresnel's reflectance for a cosine of incidence in [0, 1], from outside of index 1."""
     if form == "unity":
         return np.ones_like(cos)
-    if form == "schlick":
-        at_normal = np.square((ior - 1) / (ior + 1))
-        return at_normal + (1 - at_normal) * (1 - cos) ** 5
     g2 = ior**2 - 1 + cos**2
     g = np.sqrt(np.maximum(g2, 0))
     ratio = (cos * (g + cos) - 1) / (cos * (g - cos) + 1)

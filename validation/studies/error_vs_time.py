@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
@@ -50,6 +50,7 @@ QUICK = Cost(
     samplers=(),
 )
 DOCS = Cost(
+    size=(300, 225),
     path_size=(160, 120),
     most=16,
     counts=(),
@@ -59,14 +60,6 @@ DOCS = Cost(
     targets=("8%", "4%"),
     sampler_counts=(4, 16),
 )
-# Widths of scenes in the documentation, at which 16 rays in each pixel take some 50 ms
-WIDTHS: dict[Number, int] = {0: 384, 1: 336, 2: 300, 3: 252, 4: 192}
-
-
-def shown(scene: Number) -> Cost:
-    """Return the cost of the documentation's measurements in a scene."""
-    width = WIDTHS.get(scene, DOCS.size[0])
-    return replace(DOCS, size=(width, width * 3 // 4))
 
 
 def run(study: Study, *, quick: bool) -> None:
