@@ -27,7 +27,7 @@ import mitsuba as mi  # after ours, which finds LLVM for it
 
 Nodes = dict[str, Any]
 Run = Callable[[], object]
-Case = tuple[int, Callable[[], Run]]  # number of runs to average, and what makes the run
+Case = Callable[[], Run]  # makes a run
 
 ONE_RAY: Nodes = {"aamode": "none", "aa": 1, "lattice": "report", "focaldist": 0}
 SUPERSAMPLED: Nodes = ONE_RAY | {"aa": 4}
@@ -90,27 +90,30 @@ def command() -> Run:
 
 
 LARGE: Nodes = {"options": SUPERSAMPLED, "width": 800, "height": 600}
-CASES: dict[str, Case] = {f"scene {n}": (1, partial(render, mrt.scene_dict, n, **LARGE)) for n in range(5)}
+CASES: dict[str, Case] = {f"scene {n}": partial(render, mrt.scene_dict, n, **LARGE) for n in range(5)}
 CASES |= {
-    "a million triangles": (2, partial(render, with_triangles, 10**6, options=SUPERSAMPLED)),
-    "200 lights": (2, partial(render, with_lights, 200, options=ONE_RAY)),
-    "a thousand cones": (2, partial(render, with_cones, 1000, options=SUPERSAMPLED)),
-    "small, loaded": (100, partial(render, mrt.scene_dict, 3, options=ONE_RAY, **SMALL)),
-    "small, prepared": (100, prepared),
-    "mrt out 0": (1, command),
+    "a million triangles": partial(render, with_triangles, 10**6, options=SUPERSAMPLED),
+    "200 lights": partial(render, with_lights, 200, options=ONE_RAY),
+    "a thousand cones": partial(render, with_cones, 1000, options=SUPERSAMPLED),
+    "small, loaded": partial(render, mrt.scene_dict, 3, options=ONE_RAY, **SMALL),
+    "small, prepared": prepared,
+    "mrt out 0": command,
 }
 
 
 def seconds(case: Case) -> float:
-    """Return the mean seconds of warm runs of a case."""
-    number, make = case
-    run = make()
-    for _ in range(1 if number < 10 else 3):
+    """Return the mean seconds of warm runs of a case, over half a second or one run."""
+    run = case()
+    for _ in range(3):
         run()
+    number = 0
+    taken = 0.0
     start = time.perf_counter()
-    for _ in range(number):
+    while taken < 0.5:
         run()
-    return (time.perf_counter() - start) / number
+        number += 1
+        taken = time.perf_counter() - start
+    return taken / number
 
 
 def measured(words: Sequence[str], turn: int) -> dict[str, float]:

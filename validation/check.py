@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -10,12 +9,14 @@ from typing import Any
 import mitsuba as mi
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import OutputError, SceneError, UsageError
+from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation import laws
 from mrt_mitsuba.validation.laws.case import PREAMBLES
 from mrt_mitsuba.validation.laws.examine import TIMEOUT
+from mrt_mitsuba.validation.laws.page import Check
+from mrt_mitsuba.validation.laws.scene import SceneCheck
 
 PREAMBLES["mrt_mitsuba"] = ("import mrt_mitsuba as mrt  # before mitsuba", "mrt.register()")
 
@@ -28,25 +29,6 @@ def _with_our_errors() -> Iterator[None]:
         raise UsageError(str(error)) from error
     except laws.LoadError as error:
         raise SceneError(str(error)) from error
-
-
-class _Saved:
-    """A result whose page this package writes."""
-
-    def save(self, folder: str | os.PathLike[str]) -> None:
-        """Write a page (``index.html``), ``summary.json`` and ``laws.csv``. Raises ``OutputError``."""
-        try:
-            super().save(folder)  # type: ignore[misc]
-        except OSError as error:
-            raise OutputError(f"cannot write into {folder}: {error.strerror}") from error
-
-
-class Check(_Saved, laws.Check):
-    """The findings of a check of one plugin."""
-
-
-class SceneCheck(_Saved, laws.SceneCheck):
-    """The findings of a check of a scene."""
 
 
 def check_bsdf(
@@ -65,7 +47,7 @@ def check_bsdf(
     """
     runtime.use()
     with _with_our_errors():
-        return Check(**vars(laws.check_bsdf(bsdf, quick=quick, seed=seed, only=only, timeout=timeout)))
+        return laws.check_bsdf(bsdf, quick=quick, seed=seed, only=only, timeout=timeout)
 
 
 def check_shape(
@@ -82,7 +64,7 @@ def check_shape(
     """
     runtime.use()
     with _with_our_errors():
-        return Check(**vars(laws.check_shape(shape, quick=quick, seed=seed, only=only, timeout=timeout)))
+        return laws.check_shape(shape, quick=quick, seed=seed, only=only, timeout=timeout)
 
 
 def check_emitter(
@@ -101,8 +83,7 @@ def check_emitter(
     """
     runtime.use()
     with _with_our_errors():
-        found = laws.check_emitter(emitter, scene=scene, quick=quick, seed=seed, only=only, timeout=timeout)
-    return Check(**vars(found))
+        return laws.check_emitter(emitter, scene=scene, quick=quick, seed=seed, only=only, timeout=timeout)
 
 
 def check_scene(
@@ -130,7 +111,7 @@ def check_scene(
                 advance(1)
 
     with sized(source):
-        found = laws.check_scene(
+        return laws.check_scene(
             source.scene,
             integrator=source.integrator,
             sensor=source.sensor,
@@ -139,4 +120,3 @@ def check_scene(
             seed=seed,
             progress=each,
         )
-    return SceneCheck(**vars(found))

@@ -302,11 +302,6 @@ def p_values(ours: ArrayLike, theirs: ArrayLike) -> dict[str, float]:
     from scipy import stats
 
     sides = [np.asarray(renders, np.float64) for renders in (ours, theirs)]
-    if any(s.ndim != 4 or len(s) < 2 or s.shape[1:] != sides[0].shape[1:] for s in sides):
-        shapes = " and ".join(str(s.shape) for s in sides)
-        raise UsageError(f"renders of shape {shapes}: give two or more of each, [N, H, W, C], of one size")
-    if not all(np.isfinite(s).all() for s in sides):
-        raise UsageError("renders hold infinite or undefined values")
     light = np.maximum(*(abs(s.mean(axis=0)) for s in sides))
     sizes = {"pixel": 1, "tile": CELL, "image": max(light.shape)}
     found = {}

@@ -53,19 +53,13 @@ def ratio_of(seconds: Sequence[float], others: Sequence[float]) -> dict[str, flo
     return {**medians, "ratio": middle, "low": low, "high": high}
 
 
-def kernel_records(render: Render) -> list[Mapping[str, Any]]:
-    """Return what Dr.Jit recorded of the kernels of a ``mrt.render``, in the order of their launches."""
-    found: list[Mapping[str, Any]] = []
+def operations(render: Render) -> list[int]:
+    """Return the length of the code of each distinct kernel of a ``mrt.render``."""
+    lengths: dict[Any, int] = {}
 
     class Watch(Progress):
         def kernels(self, records: Sequence[Mapping[str, Any]]) -> None:
-            found.extend(records)
+            lengths.update({r["hash"]: r["operation_count"] for r in records if r.get("operation_count")})
 
     render(progress=Watch())
-    return found
-
-
-def operations(render: Render) -> list[int]:
-    """Return the length of the code of each distinct kernel of a ``mrt.render``."""
-    lengths = {r["hash"]: r["operation_count"] for r in kernel_records(render) if r.get("operation_count")}
     return list(lengths.values())

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from mrt_mitsuba.validation.studies.stability import axes, bounds
-from mrt_mitsuba.validation.study import Bound, Study
+from mrt_mitsuba.validation.study import Study
 
 TITLE = "Numerical stability on stiff and extreme cases"
 
@@ -27,12 +27,11 @@ def run(study: Study, *, quick: bool) -> None:
     for table, (title, cases, note) in study.each(TITLE, PARTS.items()):
         rows = []
         for case in cases(quick):
-            measured = float(case.measured)
-            row = {"case": case.name, "what": case.what, "why": case.why, "measured": measured}
+            row = {"case": case.name, "what": case.what, "why": case.why, "measured": float(case.measured)}
             if case.limit is None:
-                rows.append(row | {"bound": "-", "": "cannot hold"})
+                row |= {"bound": "-", "": "cannot hold"}
             else:
-                bound = Bound(f"{title}: {case.name}", measured, case.limit, note=case.why)
-                study.bounds.append(bound)
-                rows.append(row | {"bound": f"{bound.sign} {bound.limit:.3g}", "": bound.verdict})
+                study.at_most(f"{title}: {case.name}", case.measured, case.limit, case.why)
+                row |= {"bound": f"<= {case.limit:.3g}", "": study.bounds[-1].verdict}
+            rows.append(row)
         study.records(table, title, rows, note)
