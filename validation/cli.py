@@ -83,7 +83,7 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool, ablate: bool = 
     from mrt_mitsuba.validation.study import Study
 
     prepare_folder(out)
-    seconds = sum(STUDIES[name][2 if quick else 3] for name in names)
+    seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
     studies = []
     for name in names:

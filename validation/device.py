@@ -35,12 +35,12 @@ BOX = "cornell"
 Values = dict[str, np.ndarray]
 
 
-def scene_dict(name: str, size: dict[str, int]) -> dict[str, Any]:
+def scene_dict(name: str, size: dict[str, Any]) -> dict[str, Any]:
     """Return a numbered scene as a dict."""
     return mrt.scene_dict(int(name), **size)
 
 
-def picture(name: str, variant: str, size: dict[str, int]) -> np.ndarray:
+def picture(name: str, variant: str, size: dict[str, Any]) -> np.ndarray:
     """Render a numbered scene by the report's lattice, or Mitsuba's Cornell box, [H, W, 3]."""
     options: dict[str, Any] = {**size, "aamode": "none", "variant": variant}
     if name == BOX:
@@ -75,7 +75,7 @@ def at_ray(scene: mi.Scene, origin: Sequence[float], direction: Sequence[float])
     return {**place, "direction": mirrored, "origin": hit.spawn_ray(mirrored).o, **found}
 
 
-def first_difference(name: str, pixel: Sequence[int], variants: Sequence[str], size: dict[str, int]) -> str:
+def first_difference(name: str, pixel: Sequence[int], variants: Sequence[str], size: dict[str, Any]) -> str:
     """Follow the samples of a pixel, given as row and column, to the first value that differs.
 
     Each ray is that of the second variant, so that a difference is made where it is found.

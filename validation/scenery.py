@@ -130,7 +130,7 @@ def load_kind(
     height = height or width
     places = np.random.default_rng(1).uniform([-3, 1, -3], [3, 3, 3], (30, 3)).tolist()
     inside = {"type": "ref", "id": "fog"}
-    window = {"crop_offset_x": width // 4, "crop_offset_y": height // 4}
+    window: Node = {"crop_offset_x": width // 4, "crop_offset_y": height // 4}
     window |= {"crop_width": width, "crop_height": height, "sample_border": True}
     window |= {"width": 3 * width // 2, "height": 3 * height // 2, "rfilter": {"type": "gaussian"}}
     kinds: dict[str, Node] = {

@@ -59,7 +59,7 @@ def measure(number: int, size: tuple[int, int], repeats: int) -> Values:
         return render()
 
     turns = timed_in_turns([partial(in_turn, render) for render in ways], repeats)
-    figures = {
+    figures: dict[str, list[float]] = {
         "rays": [sum(render(count_rays=True).rays.values()) for render in ways],
         "operations": [max(operations(render)) for render in ways],
         "seconds": [float(np.median(seconds)) for _, seconds in turns],

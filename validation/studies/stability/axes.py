@@ -120,7 +120,7 @@ def lobes(cosine: Array, alpha: float, steepest: float = 4.0) -> Curves:
     truth = [exact.lobe(i, o, exact.number(a)).value for i, o in zip(wi, wo, strict=True)]
     bsdfs = (roughconductor.ours(float(a)), roughconductor.theirs(float(a)))
     found = [evaluate(mi.load_dict(bsdf), wi, wo)[0][:, 0] for bsdf in bsdfs]
-    return _off(*found, np.array(truth, float))
+    return _off(found[0], found[1], np.array(truth, float))
 
 
 def roughness(alpha: float, count: int) -> Curves:

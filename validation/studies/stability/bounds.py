@@ -144,7 +144,7 @@ def light_paths(quick: bool) -> Iterator[Case]:
 
 def path_error(scene: Scene, *, fresnel: str = "dielectric", clamp: bool = True) -> float:
     """Return the largest difference in a channel that 95 % of the pixels stay below; inf for bad values."""
-    size = {"width": 64, "height": 48}
+    size: Values = {"width": 64, "height": 48}
     truth = reference_render(scene, **size, fresnel=fresnel, clamp=clamp).image
     nodes = scene.to_dict(**size, fresnel=fresnel)
     nodes["integrator"] = {"type": "mrt_whitted", "clamp": clamp, "min_contribution": 0.0}
