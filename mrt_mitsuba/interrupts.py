@@ -42,7 +42,8 @@ def defer_signals() -> Iterator[None]:
             signal.signal(signal.SIGINT, handler)  # raises one that comes now
         finally:
             _handler = None
-            pending, _pending = _pending, False
+            pending = _pending
+            _pending = False
         if pending:
             handler(signal.SIGINT, None)
 

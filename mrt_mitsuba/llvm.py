@@ -77,17 +77,11 @@ def choose(environ: Mapping[str, str], search_path: Iterable[str], system: Itera
 def wheel_library(search_path: Iterable[str]) -> str:
     """Return the library of the package karellen-llvm-core, or "".
 
-    Its path is taken from the list of files (RECORD) in the package's metadata. ``importlib.metadata`` gives
-    the same, but importing it takes 30 ms.
+    It lies two folders above the package's metadata, in the environment's ``lib``.
     """
     for info in _matching(search_path, WHEEL.replace("-", "_") + "-"):
-        with (
-            contextlib.suppress(OSError, UnicodeDecodeError),
-            open(f"{info}/RECORD", encoding="utf-8") as lines,
-        ):
-            files = [line.split(",", 1)[0] for line in lines if "/libLLVM.so." in line]
-            for path in filter(os.path.isfile, (os.path.normpath(f"{info}/../{file}") for file in files)):
-                return path
+        for path in _matching([os.path.normpath(f"{info}/../../..")], "libLLVM.so."):
+            return path
     return ""
 
 

@@ -104,11 +104,13 @@ def memory(group: Path = GROUP) -> tuple[int, int]:
     import psutil
 
     state = psutil.virtual_memory()
-    free, total = state.available, state.total
+    free = state.available
+    total = state.total
     with contextlib.suppress(OSError, ValueError):  # no such group, or "max"
         limit = int((group / "memory.max").read_text())
         used = int((group / "memory.current").read_text())
-        free, total = min(free, limit - used), min(total, limit)
+        free = min(free, limit - used)
+        total = min(total, limit)
     return max(0, free), total
 
 

@@ -28,7 +28,7 @@ _watching = False
 
 
 def plugin_names(plugins: Any) -> list[str]:
-    """Return names of modules, and absolute paths of files and packages, given one or several.
+    """Return names of modules, and absolute paths of files, given one or several.
 
     Raises ``UsageError`` for a file that is not there or anything that is neither.
     """
@@ -42,8 +42,8 @@ def plugin_names(plugins: Any) -> list[str]:
         text = os.fspath(each)
         if not (os.sep in text or text.endswith(".py") or isinstance(each, os.PathLike)):
             names.append(text)
-        elif _source(text) is None:
-            raise UsageError(f"plugins={text}: no such Python file, or folder with an __init__.py")
+        elif not (text.endswith(".py") and os.path.isfile(text)):
+            raise UsageError(f"plugins={text}: no such Python file")
         else:
             names.append(os.path.abspath(text))
     return list(dict.fromkeys(names))
@@ -67,22 +67,8 @@ def load(plugins: Any) -> None:
 
 
 def digest(name: str) -> str:
-    """Return a digest of a plugin's file, or of the files of its package; "" for the name of a module."""
-    source = _source(name) if os.sep in name else None
-    if source is None:
-        return ""
-    files = sorted(source.parent.rglob("*.py")) if source.name == "__init__.py" else [source]
-    total = hashlib.sha256()
-    for file in files:
-        total.update(file.read_bytes())
-    return total.hexdigest()
-
-
-def _source(path: str) -> Path | None:
-    """Return the file to execute for a path: itself or a package's ``__init__.py``; None if not there."""
-    if os.path.isdir(path):
-        path = os.path.join(path, "__init__.py")
-    return Path(path) if path.endswith(".py") and os.path.isfile(path) else None
+    """Return a digest of a plugin's file; "" for the name of a module."""
+    return hashlib.sha256(Path(name).read_bytes()).hexdigest() if os.sep in name else ""
 
 
 def _load_all(variant: str) -> None:
@@ -102,15 +88,13 @@ def _load_all(variant: str) -> None:
 
 def _execute(name: str) -> ModuleType:
     """Execute a module, anew if it has been executed before."""
-    source = _source(name) if os.sep in name else None
-    if source is None:
+    if os.sep not in name:
         if any(name == known for _, known in _executed):
             _forget(name)
         return importlib.import_module(name)
-    title = source.parent.name if source.name == "__init__.py" else source.stem
-    alias = f"mrt_user_plugin_{title}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    alias = f"mrt_user_plugin_{Path(name).stem}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     _forget(alias)
-    spec: Any = importlib.util.spec_from_file_location(alias, source)
+    spec: Any = importlib.util.spec_from_file_location(alias, name)
     module = sys.modules[alias] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

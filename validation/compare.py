@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from mrt_mitsuba.adaptive.metric import METRICS
 from mrt_mitsuba.adaptive.tails import exceedance
 from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
-from mrt_mitsuba.files.images import read_channels, write_exr, write_png
+from mrt_mitsuba.files.images import read_channels, save
 from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.rendering.api import Result
 from mrt_mitsuba.validation.laws.law import sidak
@@ -106,11 +106,11 @@ class Difference:
             check_target(f"{stem}.{ending}", self.inputs)
         values = self.difference
         shown = values if values.shape[2] == 3 else np.repeat(values[..., :1], 3, axis=2)
-        write_exr(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures(CHEAP).items()})
+        save(f"{stem}.exr", shown, header={k: str(v) for k, v in self.measures(CHEAP).items()})
         size = abs(values).max(axis=2)
         scale = np.max(size, initial=0, where=np.isfinite(size)) or 1
         colors = colormaps["inferno"](size / scale)  # what is above 1 as 1
-        write_png(f"{stem}.png", np.float32(colors[..., :3]))
+        save(f"{stem}.png", np.float32(colors[..., :3]))
 
     def text(self, names: Sequence[str] = MEASURES) -> str:
         """Return a line for each of these measures, and one that says where the largest difference is."""

@@ -58,7 +58,7 @@ REACH = MAX_AMOUNT  # rows and columns of neighbours that a pixel may depend on,
 MODES = ("report", "corrected")
 
 
-def blur_amount(depth: Array, *, focal_distance: float | None, focal_range: float = 2.0) -> Array:
+def blur_amount(depth: Array, *, focal_distance: float | None, focal_range: float = 2.0) -> np.ndarray:
     """The amount of blur a, [H, W] float32: ``clamp(|focal_distance − depth| − focal_range, 0, 8)``.
 
     A miss gives 8, NaN gives 0, and without a focal distance (None, zero or negative) all is 0.
@@ -87,7 +87,6 @@ def gaussian_dof(
     """The picture as a lens focused at a distance would show it, [H, W, 3] float32.
 
     Without a focal distance (None, zero or negative) the picture comes back as it is, the same object.
-    Otherwise the result is an array of the same kind: NumPy for NumPy, a Dr.Jit tensor for a tensor.
 
     Args:
         image: [H, W, 3], linear, top row first.

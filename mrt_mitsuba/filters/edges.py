@@ -9,7 +9,7 @@ Common to all:
 * The outermost rows and columns are never edges, and their value is 0.
 * A pixel that is no finite number makes its 3×3 neighbourhood edges with value infinity, and nothing further
   away.
-* NumPy arrays give NumPy arrays; Dr.Jit tensors give tensors of the same backend, without derivatives.
+* Pictures are NumPy arrays, or what NumPy makes one of, such as Dr.Jit's tensors, and results are NumPy's.
 * Arithmetic is float32 in a fixed order, so a result does not change from run to run.
 
 Noise. A Monte Carlo picture differs from pixel to pixel without any edge. Where the variance of the pixels is
@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
+import numpy as np
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.filters.grid import Grid, check_numbers, finite
@@ -51,8 +52,8 @@ class EdgeMap:
     measure, in the unit that its function names; infinity next to a pixel that is not finite.
     """
 
-    mask: Array
-    value: Array
+    mask: np.ndarray
+    value: np.ndarray
 
 
 def luma_edges(

@@ -19,7 +19,7 @@ from mrt_mitsuba.errors import UsageError
 if TYPE_CHECKING:
     from mitsuba import Float, Int, Mask
 
-    Array: TypeAlias = Any  # [H, W, ...]: np.ndarray or TensorXf
+    Array: TypeAlias = Any  # [H, W, ...]: what NumPy makes an array of
     Add = Callable[[Int, Sequence[Float]], Sequence[Float]]
 
 
@@ -29,8 +29,8 @@ class Grid:
     A filter writes its maths once over these flat arrays: the JIT backends fuse it into kernels, and
     ``drjit.scalar`` runs the same operations one after the other.
 
-    The backend is that of ``image`` if it is a Dr.Jit tensor. For anything else it is that of the current
-    Mitsuba variant, or without one LLVM where that works and else ``drjit.scalar``.
+    The backend is that of the current Mitsuba variant, or without one LLVM where that works and else
+    ``drjit.scalar``.
 
     Sizes, and the options of filters, are opaque to Dr.Jit: a new value makes no new kernel.
     """
@@ -40,16 +40,11 @@ class Grid:
         if len(shape) < 2:
             raise UsageError(f"image has shape {shape}; expected [rows, columns] or more")
         mitsuba = sys.modules.get("mitsuba")
-        if dr.is_tensor_v(image):
-            names = {dr.JitBackend.LLVM: "llvm", dr.JitBackend.CUDA: "cuda"}
-            backend = names.get(dr.backend_v(image), "scalar")
-        elif mitsuba and mitsuba.variant():
+        if mitsuba and mitsuba.variant():
             backend = mitsuba.variant().partition("_")[0]
         else:
             backend = "scalar" if llvm.problem(llvm.prepare()) else "llvm"
-        self._tensor = importlib.import_module(f"drjit.{backend}").TensorXf
-        self._kind = type(image) if dr.is_tensor_v(image) else np.ndarray
-        self.Float: Any = dr.array_t(self._tensor)
+        self.Float: Any = dr.array_t(importlib.import_module(f"drjit.{backend}").TensorXf)
         self.Int: Any = dr.int32_array_t(self.Float)
         self.Bool: Any = dr.mask_t(self.Float)
         self.rows, self.columns = shape[:2]
@@ -68,8 +63,6 @@ class Grid:
         if np.shape(array) != shape or self.count == 0:
             expected = "at least one pixel" if 0 in shape else f"[{', '.join(map(str, shape))}]"
             raise UsageError(f"{name} has shape {np.shape(array)}; expected {expected}")
-        if dr.is_tensor_v(array):
-            return self._tensor(dr.detach(array, preserve_type=False)).array
         return self.Float(np.ascontiguousarray(array, dtype=np.float32).ravel())
 
     def planes(self, array: Array, name: str) -> list[Float]:
@@ -104,8 +97,8 @@ class Grid:
         _, *sums = dr.while_loop((self.Int(0), *totals), is_before_end, advance)
         return sums
 
-    def output(self, planes: Sequence[Float | Mask], channels: Sequence[int] = ()) -> Array:
-        """Planes as one array [rows, columns, *channels] of the kind that the filter was given.
+    def output(self, planes: Sequence[Float | Mask], channels: Sequence[int] = ()) -> np.ndarray:
+        """Planes as one NumPy array [rows, columns, *channels].
 
         ``planes``: one plane of numbers or truth values, or several to be interleaved.
         """
@@ -114,16 +107,7 @@ class Grid:
             flat = dr.empty(self.Float, len(planes) * self.count)
             for channel, plane in enumerate(planes):
                 dr.scatter(flat, plane, len(planes) * self.index + channel)
-        shape = (self.rows, self.columns, *channels)
-        if self._kind is np.ndarray:
-            return np.array(flat).reshape(shape)
-        dr.eval(flat)
-        ours = self._tensor
-        theirs = dr.float32_array_t(self._kind)
-        if dr.is_mask_v(flat):
-            ours = dr.mask_t(ours)
-            theirs = dr.mask_t(theirs)
-        return theirs(ours(flat, shape))
+        return np.array(flat).reshape(self.rows, self.columns, *channels)
 
 
 def check_numbers(**options: float) -> None:

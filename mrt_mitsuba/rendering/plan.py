@@ -57,7 +57,8 @@ class Pass:
         """Return the number of samples of a pixel in words, such as "15 more samples, 2 rays each"."""
         if self.pattern.lattice == FILM:
             return f"{self.pattern.size}{more} samples" if self.pattern.size > 1 else f"1{more} sample"
-        count, repeats = self.pattern.count, self.pattern.repeats
+        count = self.pattern.count
+        repeats = self.pattern.repeats
         text = f"{count}{more} sample{'s' if count > 1 else ''}"
         return f"{text}, {repeats} rays each" if repeats > 1 else text
 

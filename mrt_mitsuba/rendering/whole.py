@@ -19,7 +19,9 @@ def whole_pictures(
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Pictures [H, W, channels], which have so many rays a pixel in all and fit into memory, with the rays of
     each."""
-    job, film, shader = exposer.job, exposer.film, exposer.shader
+    job = exposer.job
+    film = exposer.film
+    shader = exposer.shader
     if film.bands:
         raise UsageError(
             f"the integrator {shader.name} gives whole pictures, which this film keeps as "

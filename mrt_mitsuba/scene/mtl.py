@@ -70,14 +70,12 @@ def read_mtl(path: StrPath, *, convention: str = "report", folder: Path | None =
 def find_material(materials: Iterable[str], text: str) -> str | None:
     """Return the name among ``materials`` that a ``usemtl`` statement means, or None.
 
-    Names may hold a number sign (``Material #1``), and a comment may follow a name in both files.
+    Names may hold a number sign (``Material #1``), and a comment may follow a name.
     """
-    plain = _without_comment(text)
-    for name in (text, plain, text.partition("#")[0].strip()):
+    for name in (_without_comment(text), text.partition("#")[0].strip()):
         if name in materials:
             return name
-    alike = [name for name in materials if _without_comment(name) in (text, plain)]
-    return alike[0] if len(alike) == 1 else None
+    return None
 
 
 def _without_comment(name: str) -> str:
@@ -115,8 +113,8 @@ class _Reader:
             problem = {"newmtl": "has no name; write newmtl NAME", "map_Kd": "names no file"}[statement]
             raise SceneError(f"{where}: {statement} {problem}")
         if statement == "newmtl":
-            self.name = text
-            self.blocks[text] = {}
+            self.name = _without_comment(text)
+            self.blocks[self.name] = {}
         elif statement in _KNOWN:
             if not self.name:
                 raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")

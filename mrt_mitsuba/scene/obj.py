@@ -180,17 +180,15 @@ class _Reader:
         """Read the libraries that a statement names; of materials of one name, the first counts."""
         folder = self.path.parent
         plain = text.partition("#")[0].strip()
-        pieces = re.findall(r"\S.*?\.mtl(?=\s|$)", plain, re.IGNORECASE)  # each may have blanks in it
-        found = {name: find(name, [folder]) for name in dict.fromkeys([text, plain, *pieces, *plain.split()])}
-        whole = [name for name in (text, plain) if found[name]][:1]
-        if not whole and not pieces:
-            whole = [plain] if not any(found.values()) else plain.split()
-        for name in whole or pieces:
-            library = found[name]
-            if library is None:
-                text = f"the material library {name} {MISSING} {folder}; its materials get the default"
-                self.note("libraries", text)
-            elif str(library) not in self.libraries:
+        names = [text, plain] if find(text, [folder]) or find(plain, [folder]) else plain.split()
+        found = [library for name in names if (library := find(name, [folder]))]
+        if not found:
+            self.note(
+                "libraries",
+                f"the material library {plain} {MISSING} {folder}; its materials get the default",
+            )
+        for library in found:
+            if str(library) not in self.libraries:
                 self.libraries.add(str(library))
                 self.materials = read_mtl(library, convention=self.convention, folder=folder) | self.materials
 

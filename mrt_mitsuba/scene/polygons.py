@@ -12,9 +12,8 @@ _PLANES = ((1, 2), (2, 0), (0, 1))  # coordinates to project to, by axis
 def triangulate(polygons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cut polygons [F, corners, 3] into triangles: corners [F, corners - 2, 3], and which ones failed [F].
 
-    A fan around the first corner if none of its triangles is turned over, or else around the second (one of
-    the two suits every quadrilateral), or else by cutting off ears. A polygon that crosses itself fails, and
-    some of its triangles overlap or are missing.
+    A fan around the first corner if none of its triangles is turned over, or else by cutting off ears. A
+    polygon that crosses itself fails, and some of its triangles overlap or are missing.
     """
     number, count, _ = polygons.shape
     second = np.arange(1, count - 1)
@@ -25,20 +24,9 @@ def triangulate(polygons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return cut, failed
     points = polygons - polygons[:, :1].astype(np.float64)
     normals = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)  # of twice the area
-
-    def turned(triangles: np.ndarray) -> np.ndarray:
-        """True for polygons with a triangle that is turned over."""
-        first, middle, last = (points[:, triangles[:, k]] for k in range(3))
-        areas = np.einsum("fti,fi->ft", np.cross(middle - first, last - first), normals)
-        return (areas < -AREA_TOLERANCE * (normals**2).sum(axis=1, keepdims=True)).any(axis=1)
-
-    rest = np.flatnonzero(turned(fan))
-    if not len(rest):
-        return cut, failed
-    other = (fan + 1) % count
-    suits = ~turned(other)[rest]
-    cut[rest[suits]] = other
-    for row in rest[~suits]:
+    areas = np.einsum("fti,fi->ft", np.cross(points[:, 1:-1], points[:, 2:]), normals)  # of the fan, twice
+    turned = (areas < -AREA_TOLERANCE * (normals**2).sum(axis=1, keepdims=True)).any(axis=1)
+    for row in np.flatnonzero(turned):
         axis = np.abs(normals[row]).argmax()
         plane = _PLANES[axis] if normals[row, axis] > 0 else _PLANES[axis][::-1]
         ears = _ears(points[row][:, plane]) if count <= MAX_EAR_CORNERS else None

@@ -15,7 +15,7 @@ from scipy import ndimage, stats
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
-from mrt_mitsuba.files.images import read_exr, write_exr
+from mrt_mitsuba.files.images import read_exr, save
 from mrt_mitsuba.validation.compare import p_values
 
 pytest.importorskip("flip_evaluator")
@@ -94,7 +94,7 @@ def test_infinite_depths_are_equal_where_both_are():
 def mean_of(rays: np.ndarray, path: Path) -> Path:
     """Write the mean of rays [N, H, W, C] with its standard error."""
     error = np.sqrt(rays.var(axis=0, ddof=1).mean(axis=-1) / len(rays))
-    write_exr(path, np.broadcast_to(rays.mean(axis=0), (*error.shape, 3)), {"error": error})
+    save(path, np.broadcast_to(rays.mean(axis=0), (*error.shape, 3)), layers={"error": error})
     return path
 
 
@@ -143,9 +143,9 @@ def test_results_have_layers(variant):
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, str]:
     depth = np.full((12, 16), 2.0, np.float32)
-    write_exr(tmp_path / "a.exr", spotted(), {"depth": 1.5 * depth})
-    write_exr(tmp_path / "b.exr", GREY, {"depth": depth})
-    write_exr(tmp_path / "nan.exr", np.where(spotted() > 0.55, np.nan, GREY))
+    save(tmp_path / "a.exr", spotted(), layers={"depth": 1.5 * depth})
+    save(tmp_path / "b.exr", GREY, layers={"depth": depth})
+    save(tmp_path / "nan.exr", np.where(spotted() > 0.55, np.nan, GREY))
     kind = {"type": OpenEXR.scanlineimage}
     shifted = {"dataWindow": ((100, 200), (115, 211)), "displayWindow": ((0, 0), (639, 479))}
     OpenEXR.File(kind | shifted, {"RGB": GREY}).write(str(tmp_path / "shifted.exr"))

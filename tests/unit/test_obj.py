@@ -211,10 +211,10 @@ def test_names_of_materials(model, name, use, found):
 
 
 def test_the_first_library_that_has_a_material_counts(model, tmp_path):
-    for name, value in (("a.mtl", 0.25), ("my b.mtl", 0.5)):
+    for name, value in (("a.mtl", 0.25), ("b.mtl", 0.5)):
         (tmp_path / name).write_text(f"newmtl m\nKd {value}\nnewmtl {name[-5]}\nKd {value}\n")
     face = "usemtl m\nf 1 2 3\nusemtl b\nf 1 3 4\n"
-    first, second = model(f"mtllib a.mtl my b.mtl\n{SQUARE}{face}")
+    first, second = model(f"mtllib a.mtl b.mtl\n{SQUARE}{face}")
     assert (first.material.diffuse[0], second.material.diffuse[0]) == (0.25, 0.5)
 
 
