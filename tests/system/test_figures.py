@@ -40,13 +40,12 @@ def test_a_study_answers_what_pages_show():
         path_size=(24, 18),
         amounts=(1, 2),
         most=4,
-        counts=(),
+        counts=(4,),
         path_spp=64,
         repeats=1,
         rounds=(16,),
         targets=("20%",),
         samplers=("independent", "multijitter"),
-        sampler_counts=(4,),
     )
     panels = error_vs_time.choices(0, cost)
     assert [bool(found.failed) for found in panels.values()] == [False, False]

@@ -28,13 +28,12 @@ class Cost:
     path_size: tuple[int, int] = (240, 180)  #: of those that paths make
     amounts: tuple[int, ...] = (1, 2, 4, 8)  #: of ``aa``
     most: int = 48  #: ``aa`` of the reference
-    counts: tuple[int, ...] = (1, 4, 16, 64)  #: of rays a pixel
+    counts: tuple[int, ...] = (4, 16, 64)  #: of rays a pixel, with each of Mitsuba's samplers
     path_spp: int = 2048  #: of the reference by paths
     repeats: int = 5
     rounds: tuple[int, ...] = (8, 16, 64)  #: rays a pixel where they go to noise
     targets: tuple[str, ...] = ("4%", "2%", "1%")
     samplers: tuple[str, ...] = SAMPLERS
-    sampler_counts: tuple[int, ...] = (4, 16, 64)
 
 
 QUICK = Cost(
@@ -47,18 +46,17 @@ QUICK = Cost(
     repeats=1,
     rounds=(),
     targets=(),
-    samplers=(),
+    samplers=("independent",),
 )
 DOCS = Cost(
     size=(300, 225),
     path_size=(160, 120),
     most=16,
-    counts=(),
+    counts=(4, 16),
     path_spp=1024,
     repeats=3,
     rounds=(16,),
     targets=("8%", "4%"),
-    sampler_counts=(4, 16),
 )
 
 
@@ -137,15 +135,15 @@ def sampling(number: int, cost: Cost) -> Findings:
 def path(number: Number, cost: Cost) -> Findings:
     """Measure Mitsuba's path and direct with its samplers, and mrt_whitted, against a converged path."""
     nodes = _scene(number, cost.path_size)
-    calm = number in CALM
     cases = _rounds(cost, integrator="path")
-    for kind in ("path", "direct") if calm else ("path",):
-        cases |= {f"{kind}, spp={spp}": {"integrator": kind, "spp": spp} for spp in cost.counts}
-    for sampler in cost.samplers:
-        sensor = nodes["sensor"] | {"sampler": {"type": sampler}}
-        own = {"scene": nodes | {"sensor": sensor}, "integrator": "path"}
-        cases |= {f"{sampler} sampler, spp={spp}": {**own, "spp": spp} for spp in cost.sampler_counts}
-    if calm and cost.counts:
+    for spp in cost.counts:
+        for sampler in cost.samplers:
+            sensor = nodes["sensor"] | {"sampler": {"type": sampler}}
+            own = {"scene": nodes | {"sensor": sensor}, "integrator": "path"}
+            cases[f"path, {sampler} sampler, spp={spp}"] = own | {"spp": spp}
+        if number in CALM:
+            cases[f"direct, spp={spp}"] = {"integrator": "direct", "spp": spp}
+    if number in CALM:
         cases["mrt_whitted"] = {}
         cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
     return error_vs_time(
