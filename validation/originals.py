@@ -76,13 +76,11 @@ def side_by_side(folder: str | os.PathLike[str]) -> tuple[Figure, list[dict[str,
         result = mrt.render(original.scene, fresnel="dielectric", progress=Progress(), **original.options)
         ours = original.like(result.image)
         difference = np.abs(ours - original.image)
-        for axes, picture in zip(row, (original.image, ours, 100 * difference), strict=True):
+        shown = {"original": original.image, "ours": ours, "|difference| × 100": 100 * difference}
+        for axes, (title, picture) in zip(row, shown.items(), strict=True):
             plotting.show_picture(axes, picture)
-        row[0].set_ylabel(f"scene {scene}")
+            axes.set_title(f"scene {scene}: {title}", loc="left")
         off = f"{(difference.max(axis=-1) > 1 / 255).mean():.2%}"
-        rows.append(
-            {"scene": scene, "mean difference": float(difference.mean()), "pixels off by > 1/255": off}
-        )
-    for axes, title in zip(plots[0], ("original", "ours", "|difference| × 100"), strict=True):
-        axes.set_title(title, loc="left")
+        mean = float(difference.mean())
+        rows.append({"scene": scene, "mean difference": mean, "pixels off by > 1/255": off})
     return drawn, rows

@@ -71,21 +71,15 @@ def show_picture(axes: Axes, picture: np.ndarray, tonemap: str = "report") -> No
     axes.spines[:].set_visible(False)
 
 
-def show_map(axes: Axes, values: np.ndarray) -> None:
-    """Show positive values [H, W] in colours, on a logarithmic scale."""
-    least, most = np.quantile(values[values > 0], (0.05, 1))
-    shown = axes.imshow(np.maximum(values, least), cmap="viridis", norm="log", vmin=least, vmax=most)
-    axes.figure.colorbar(shown, ax=axes, location="bottom", fraction=0.05, pad=0.02)
-    axes.set(xticks=[], yticks=[], anchor="N")
-    axes.spines[:].set_visible(False)
-
-
 def maps(result: Any) -> list[Figure]:
     """Return plots of the reported error and the samples of each pixel of an adaptive render."""
     height, width = result.image.shape[:2]
     figures = []
     for layer, title in MAPS.items():
         drawn, axes = panel(title, height=4.6 * height / width + 0.8)
-        show_map(axes, result.layers[layer])
+        shown = axes.imshow(result.layers[layer], norm="log")
+        drawn.colorbar(shown, location="bottom", fraction=0.05, pad=0.02)
+        axes.set(xticks=[], yticks=[], anchor="N")
+        axes.spines[:].set_visible(False)
         figures.append(drawn)
     return figures

@@ -62,7 +62,10 @@ def error_against_time() -> Answer:
         work_precision.diagram(title, found)
         for title, found in panels.items()
     ]
-    rows = error_vs_time.advice(panels)
+    rows = []
+    for title, found in panels.items():
+        some = found.errors[len(found.errors) // 2 :][:1]  # in the middle
+        rows += [{"in": title, **found.race(error)} for error in some]
     decided = sum(row["next best"] is not None for row in rows)
     return answer(
         f"In {decided} of these {len(rows)} comparisons, one way is the "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,14 +81,6 @@ def choices(number: Number, cost: Cost) -> dict[str, Findings]:
     if number == BOX or number in CALM:
         found[f"{title_of(number)}, light paths"] = path(number, cost)
     return found
-
-
-def advice(panels: Mapping[str, Findings]) -> list[Values]:
-    """Return a row for each title of ``choices``: the settings to use to get to one error, in the middle."""
-    rows = []
-    for title, found in panels.items():
-        rows += [{"in": title, **row} for row in found.advice()[len(found.errors) // 2 :][:1]]
-    return rows
 
 
 def title_of(number: Number) -> str:

@@ -52,8 +52,8 @@ def draw(scene: Scene | int, size: tuple[int, int], **integrator: Any) -> np.nda
     return mrt.render(scene, **{**options, "fresnel": "dielectric", "integrator": settings}).image
 
 
-def hold(study: Study, number: int, error: np.ndarray, reason: np.ndarray) -> Values:
-    """Hold a scene that was judged to its bounds; return the figures by name."""
+def hold(study: Study, number: int, error: np.ndarray, reason: np.ndarray) -> None:
+    """Hold a scene that was judged to its bounds."""
     edges = "rounding sends single pixels to the other side of an edge: measured up to two in ten thousand"
     least = f"least fault: 1 % off by {MOST[number]:g}"
     found = {
@@ -64,7 +64,6 @@ def hold(study: Study, number: int, error: np.ndarray, reason: np.ndarray) -> Va
     }
     for what, bound in found.items():
         study.at_most(f"scene {number}: {what}", *bound)
-    return {what: bound[0] for what, bound in found.items()}
 
 
 def run(study: Study, *, quick: bool) -> None:
@@ -75,6 +74,7 @@ def run(study: Study, *, quick: bool) -> None:
         scene = report_scene(number)
         error, reason = judge(draw(scene, size), scene)
         counts = {word: int(np.sum(reason == i)) for i, word in enumerate(REASONS)}
-        rows.append({"scene": number, **hold(study, number, error, reason), **counts})
+        hold(study, number, error, reason)
+        rows.append({"scene": number, **counts})
     note = f"{size[0]}x{size[1]}, one sample a pixel. By reason: pixels off by more than 1/255."
     study.records("scenes", "Our pictures against the float64 tracer", rows, note)
