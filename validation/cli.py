@@ -21,17 +21,17 @@ from mrt_mitsuba.rendering.progress import TerminalProgress
 if TYPE_CHECKING:
     from mrt_mitsuba.validation.study import Study
 
-# By name: the module, imported when it is run; what --list says of it; seconds of a quick and of a full run
-# on two idle cores, about
+# By name, which is that of a module: what --list says of it; seconds of a quick and of a full run on two idle
+# cores, about
 STUDIES = {
-    "roughconductor": ("roughconductor", "is the material the function that Mitsuba's is", 10, 90),
-    "stock": ("stock", "are light, gloss and mirrors what Mitsuba computes", 15, 60),
-    "scenes": ("scenes", "are the report's scenes right, with a reason for each pixel off", 10, 60),
-    "adaptive": ("adaptive", "what does an error cost next to the best sampler", 90, 1500),
-    "honest": ("honest", "is the mean right and the error as stated, calm to wild", 20, 1200),
-    "stability": ("stability", "where must float32 give out, and where does it not", 16, 150),
-    "error-vs-time": ("error_vs_time", "what does each setting buy for its time", 9, 1200),
-    "needs": ("needs", "what do scenes not need, and what would it cost", 9, 60),
+    "roughconductor": ("is the material the function that Mitsuba's is", 10, 90),
+    "stock": ("are light, gloss and mirrors what Mitsuba computes", 15, 60),
+    "scenes": ("are the report's scenes right, with a reason for each pixel off", 10, 60),
+    "adaptive": ("what does an error cost next to the best sampler", 90, 1500),
+    "honest": ("is the mean right and the error as stated, calm to wild", 20, 1200),
+    "stability": ("where must float32 give out, and where does it not", 16, 150),
+    "error-vs-time": ("what does each setting buy for its time", 9, 1200),
+    "needs": ("what do scenes not need, and what would it cost", 9, 60),
 }
 EXTRAS = ("matplotlib", "jinja2", "scipy", "mpmath", "flip_evaluator")
 INTERRUPTED = 128 + signal.SIGINT
@@ -83,13 +83,12 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool, ablate: bool = 
     from mrt_mitsuba.validation.study import Study
 
     prepare_folder(out)
-    seconds = sum(STUDIES[name][2] if quick else STUDIES[name][3] for name in names)
+    seconds = sum(STUDIES[name][1] if quick else STUDIES[name][2] for name in names)
     print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
     studies = []
     for name in names:
         study = Study(name, name, TerminalProgress(unit="step"))
-        module = "ablation" if ablate and name == "adaptive" else STUDIES[name][0]
-        run_study(study, module, quick=quick)
+        run_study(study, "ablation" if ablate and name == "adaptive" else name, quick=quick)
         print(study, flush=True)
         studies.append(study)
     save_report(out, *studies, quick=quick)
@@ -106,7 +105,7 @@ def run_study(study: Study, module_name: str, *, quick: bool) -> None:
     start = time.perf_counter()
     try:
         runtime.use(runtime.default_variant())
-        module = import_module(f"mrt_mitsuba.validation.studies.{module_name}")
+        module = import_module(f"mrt_mitsuba.validation.studies.{module_name.replace('-', '_')}")
         study.title = module.TITLE
         print(f"{study.name}: {study.title} ...", file=sys.stderr, flush=True)
         module.run(study, quick=quick)
@@ -120,7 +119,7 @@ def run_study(study: Study, module_name: str, *, quick: bool) -> None:
 def listing() -> str:
     """Return a line on each study, with how long it takes on two idle cores."""
     lines = [f"  {'':<15}{'quick':>7}{'full':>8}"]
-    for name, (_, about, quick, full) in STUDIES.items():
+    for name, (about, quick, full) in STUDIES.items():
         lines.append(f"  {name:<15}{_spoken(quick):>7}{_spoken(full):>8}  {about}")
     return "\n".join(lines)
 

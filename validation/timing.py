@@ -15,13 +15,6 @@ Item = TypeVar("Item")
 Render = Callable[..., object]
 
 
-def timed(run: Callable[..., Item], *arguments: object) -> tuple[Item, float]:
-    """Return the result of a function, and the seconds it took."""
-    start = time.perf_counter()
-    result = run(*arguments)
-    return result, time.perf_counter() - start
-
-
 def in_turns(sides: Sequence[Callable[[int], Item]], turns: int) -> list[list[Item]]:
     """Return the results of each side, called with the number of each turn.
 
@@ -40,6 +33,10 @@ def timed_in_turns(sides: Sequence[Callable[[int], Any]], turns: int) -> list[tu
 
     Each side runs once before, which compiles its kernels.
     """
+
+    def timed(side: Callable[[int], Any], turn: int) -> tuple[Any, float]:
+        start = time.perf_counter()
+        return side(turn), time.perf_counter() - start
 
     in_turns(sides, 1)
     runs = in_turns([partial(timed, side) for side in sides], turns)

@@ -213,12 +213,11 @@ class Findings:
         return sentences
 
     def __str__(self) -> str:
-        width = max(map(len, [*self.points, *self.failed]), default=0)
         lines = [self.warning] if self.warning else []
         for p in self.points.values():
             error = _shown(p.rmse, *p.rmse_interval)
-            lines.append(f"{p.name:<{width}}  {_shown(p.seconds, *p.seconds_interval)} s, RMSE {error}")
-        lines += [f"{name:<{width}}  FAILED {why}" for name, why in self.failed.items()]
+            lines.append(f"{p.name:<20}  {_shown(p.seconds, *p.seconds_interval)} s, RMSE {error}")
+        lines += [f"{name:<20}  FAILED {why}" for name, why in self.failed.items()]
         own = f"{self.reference_error:.2g}" if self.reference_error else "not known"
         return "\n".join([*lines, f"the reference's own error: {own}", *self.verdicts])
 

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.linalg import norm
 from PIL import Image
 
-from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.scene.model import Cone, Cylinder, Mesh, Plane, Scene, Sphere
 
 # Secondary rays start this far off the surface, relative to the coordinates and distances that led to the
@@ -54,13 +53,9 @@ def reference_render(
     """Render a scene with one ray through each pixel, exactly to the rounding of float64.
 
     ``displacement``: of the rays, in pixels, y upwards. ``fresnel``: "dielectric" or "unity". ``clamp``: each
-    light's part to [0, 1], as the report does. Raises ``SceneError`` for a texture on anything but triangles,
-    and for one that is not looked up as in the report.
+    light's part to [0, 1], as the report does. Textures are drawn on triangles only, as in the report.
     """
     camera = scene.camera
-    textured = [thing for thing in objects(scene) if thing.material.texture]
-    if any(getattr(thing, "uvs", None) is None or scene.texturing != "report" for thing in textured):
-        raise SceneError("float64 draws textures on triangles only, looked up as in the report")
     # The first row is the lowest; the column grows along up × forward: mirrored against a right-handed
     # camera, as in the original
     pixel = np.arange(width * height)
@@ -77,15 +72,10 @@ def reference_render(
     return ReferenceResult(*(layer.reshape(height, width, *layer.shape[1:])[::-1] for layer in layers))
 
 
-def objects(scene: Scene) -> list[Any]:
-    """The objects of a scene in the order of their numbers."""
-    return [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
-
-
 @np.errstate(all="ignore")
 def _radiance(scene: Scene, o: Array, d: Array, fresnel: str, clamp: bool) -> tuple[Array, Array]:
     """The light [N, 3] that comes back along rays, and the hashes of their decisions [N]."""
-    things = objects(scene)
+    things = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
     materials = [thing.material for thing in things]
     numbers = np.array([*((m.ior, m.alpha, *m.specular) for m in materials), NOTHING])
     light = np.zeros(d.shape)

@@ -14,7 +14,6 @@ from mrt_mitsuba.validation.work_precision import Findings, describe, error_vs_t
 
 TITLE = "Error against run time"
 
-SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 BOX = "Cornell box"
 
 Number = int | str  # of a scene of the report, or ``BOX``
@@ -33,7 +32,7 @@ class Cost:
     repeats: int = 5
     rounds: tuple[int, ...] = (8, 16, 64)  #: rays a pixel where they go to noise
     targets: tuple[str, ...] = ("4%", "2%", "1%")
-    samplers: tuple[str, ...] = SAMPLERS
+    samplers: tuple[str, ...] = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 
 
 QUICK = Cost(

@@ -125,9 +125,8 @@ class RoughconductorComparison:
         return not unlikely and all(self.errors[name] <= POINTWISE for name in NAMES)
 
     def __str__(self) -> str:
-        seconds = {f"{name} [s]": self.timings[name] for name in ("ours", "theirs")}
-        rows = {**self.errors, **seconds, "time, ours / theirs": self.timings["ratio"]}
         verdict = "equal" if self.equal else "different"
+        rows = {**self.errors, "time, ours / theirs": self.timings["ratio"]}
         lines = [f"  {name:<44} {value:.4g}" for name, value in rows.items()]
         return "\n".join([f"mrt_bsdf and roughconductor, alpha = {self.alpha:g}: {verdict}", *lines])
 

@@ -103,11 +103,6 @@ def _ball(**changes: Any) -> Scene:
     return replace(BASE, spheres=(replace(BALL, material=replace(GREY, **changes)),))
 
 
-def _shiny(**changes: Any) -> Scene:
-    """Return a material without a diffuse part, which would hide the lobe."""
-    return replace(_ball(diffuse=(0, 0, 0), specular=(1, 1, 1), **changes), sky=(0, 0, 0))
-
-
 def _lit(position: tuple[float, float, float], color: float = 1.0) -> Scene:
     return replace(BASE, lights=(Light(position, (color,) * 3),))
 
@@ -125,18 +120,16 @@ def light_paths(quick: bool) -> Iterator[Case]:
     """Yield scenes that are hard on a path tracer, held to the float64 tracer."""
     hall: Values = {"fresnel": "unity"}
     bright = _lit((2, 3, 4), 1e4)
-    open_: Values = {"clamp": False}
+    unclamped: Values = {"clamp": False}
     rows: list[tuple[str, str, Scene, float, Values]] = [
         ("facing mirrors", "Ks 0.95, ten bounces", _hall(0.95), 2e-5, hall),
         ("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), 2e-5, hall),
         ("clamp on", "a light of 1e4", bright, PLAIN, {}),
-        ("clamp off", "a light of 1e4", bright, PLAIN, open_),
+        ("clamp off", "a light of 1e4", bright, PLAIN, unclamped),
         ("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), PLAIN, {}),
         ("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), PLAIN, {}),
         ("black", "Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3), 3e-7, {}),
-        ("negative roughness", "alpha -0.4", _shiny(alpha=-0.4), 5e-6, open_),
-        ("index just above 1", "1 + 1e-7", _shiny(ior=1.0000001), 3e-7, {}),
-        ("index 1e6", "a metal", _shiny(ior=1e6), 1e-5, {}),
+        ("negative roughness", "alpha -0.4", _ball(alpha=-0.4, diffuse=(0, 0, 0)), 5e-6, unclamped),
     ]
     for name, what, scene, limit, settings in rows:
         yield Case(name, what, "roundings", path_error(scene, **settings), limit)
@@ -187,9 +180,8 @@ def scaled_and_moved(scene: Scene, name: str) -> Iterator[Case]:
     what = "share of pixels off by more than 2/255"
     for factor in (1e-6, 1e-3, 1e3, 1e6):
         yield Case(f"{name} times {factor:g}", what, "the same picture", changed(factor, 0), SHARE_SCALED)
+    why = "coordinates have steps of 2⁻²³ of that distance: normals and outlines move"
     for sizes in (1.0, 10.0, 100.0, 1e3, 1e4):
-        step = sizes * 2**-23
-        why = f"coordinates have steps of {step:.0e} scene sizes there: normals and outlines move"
         # Very far away, float32 has no digits left for the scene
         most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
         yield Case(f"{name} moved by {sizes:g} sizes", what, why, changed(1, sizes), most)
