@@ -101,9 +101,11 @@ def register(guard: bool = True) -> None:
 
 def default_variant() -> str:
     """``llvm_ad_rgb`` if LLVM works here, else ``scalar_rgb`` with one warning per process."""
+    global _warned
     problem = obstacle(FAST)
-    if problem:
-        _warn_once(f"rendering in the slow variant {SLOW}: {problem}")
+    if problem and not _warned:
+        _warned = True
+        warn(f"rendering in the slow variant {SLOW}: {problem}")
     return SLOW if problem else FAST
 
 
@@ -115,21 +117,6 @@ def obstacle(variant: str) -> str | None:
         return None
     none = f"it needs an NVIDIA GPU with its driver, and none was found. Use {FAST} or {SLOW}."
     return None if dr.has_backend(dr.JitBackend.CUDA) else none
-
-
-def warn_if_slow() -> None:
-    """Say once in a process that the current variant is slow, if it is."""
-    if mi.variant().startswith("scalar"):
-        _warn_once(
-            f"{mi.variant()} traces one ray at a time in Python: use it for small pictures, else {FAST}"
-        )
-
-
-def _warn_once(text: str) -> None:
-    global _warned
-    if not _warned:
-        _warned = True
-        warn(text)
 
 
 def usable_variants() -> list[str]:

@@ -91,7 +91,6 @@ def scene():
     }
 
 
-@pytest.mark.filterwarnings("ignore:scalar_rgb traces one ray at a time")
 def test_all_variants_draw_the_same():
     pictures = []
     for variant in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_rgb"):

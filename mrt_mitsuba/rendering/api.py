@@ -208,7 +208,6 @@ def session(settings: RenderSettings) -> Iterator[Job]:
         budget = Budget.of(settings.memory)
         job = Job(settings.progress or default_progress(), budget, settings.on_round)
         variant = runtime.use(settings.variant)
-        runtime.warn_if_slow()
         try:
             yield job
         except Exception:

@@ -9,7 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.interrupts import deliver_pending
 from mrt_mitsuba.machine import Budget, Workspace
@@ -43,10 +43,10 @@ class Progress:
 
 
 class TerminalProgress(Progress):
-    """Print messages, and a bar if ``bar_file`` is a terminal, or in a notebook.
+    """Print messages, and a bar on standard error if that is a terminal, or in a notebook.
 
-    ``show_plan``: whether to print the render plan. Messages go to ``file``, or nowhere without ``messages``;
-    bars, which count in ``unit``, to ``bar_file``, for stages that take longer than ``delay`` seconds.
+    ``show_plan``, ``messages``: whether to print the render plan, and messages. Bars count in ``unit``, for
+    stages that take longer than ``delay`` seconds.
     """
 
     def __init__(
@@ -56,26 +56,22 @@ class TerminalProgress(Progress):
         messages: bool = True,
         delay: float = 0.0,
         unit: str = "px",
-        file: TextIO | None = None,
-        bar_file: TextIO | None = None,
     ) -> None:
         self.show_plan = show_plan
         self.messages = messages
         self.delay = delay
         self.unit = unit
-        self.file = file or sys.stdout
-        self.bar_file = bar_file or sys.stderr
 
     def plan(self, plan: object) -> None:
         if self.show_plan:
-            print(plan, file=self.file, flush=True)
+            print(plan, flush=True)
 
     @contextlib.contextmanager
     def stage(self, title: str, total: int, message: str = "") -> Iterator[Advance]:
-        bars = self.bar_file.isatty() or "ipykernel" in sys.modules
+        bars = sys.stderr.isatty() or "ipykernel" in sys.modules
         on_bar = message if bars and title == ROUNDS else ""  # one line, which each round updates
         if message and not on_bar and self.messages:
-            print(message, file=self.file, flush=True)
+            print(message, flush=True)
         if not bars:
             yield _ignore
             return
@@ -85,7 +81,7 @@ class TerminalProgress(Progress):
 
         looks: Any = {"unit": self.unit, "unit_scale": True, "dynamic_ncols": True, "leave": False}
         looks["delay"] = self.delay
-        with tqdm(total=total, desc=title, postfix=on_bar or None, file=self.bar_file, **looks) as bar:
+        with tqdm(total=total, desc=title, postfix=on_bar or None, **looks) as bar:
             yield bar.update
 
 

@@ -214,7 +214,6 @@ class RenderSettings:
         for field in dataclasses.fields(self):
             if field.metadata and values[field.name] is not field.default:
                 values[field.name] = check(field.name, field.metadata["kind"], values[field.name])
-        self.model()  # checks what shows nothing
 
     @classmethod
     def of(cls, **options: object) -> RenderSettings:
@@ -256,14 +255,7 @@ class RenderSettings:
         )
 
     def model(self) -> dict[str, Any]:
-        """Return the options given for a model and its view, as ``obj.obj_scene`` takes them.
-
-        Raises ``UsageError`` for a view that shows nothing.
-        """
-        if self.camera is not None and self.camera == self.target:
-            raise UsageError("camera and target are the same point: move one of them")
-        if self.up == (0, 0, 0):
-            raise UsageError("up=0,0,0: up must have a length, such as up=0,1,0")
+        """Return the options given for a model and its view, as ``obj.obj_scene`` takes them."""
         names = [name for name in MODEL_OPTIONS if name != "target" or self.error is None]
         given = {name: getattr(self, name) for name in names}
         return {name: value for name, value in given.items() if value is not None}

@@ -37,7 +37,6 @@ MOVING = {"motion": (0.3, 0.1, 0.4), "motionsamples": 4}
     ],
     indirect=["variant"],
 )
-@pytest.mark.filterwarnings("ignore:scalar_:mrt_mitsuba.MrtWarning")
 def test_pictures_are_those_of_the_scalar_variant(number, variant, more):
     options = {"aa": 1, "aamode": "none", "focaldist": 0, **SIZE, **more}
     result = mrt.render(number, variant=variant, **options)

@@ -42,12 +42,6 @@ def test_rays_are_counted_as_the_scene_tells():
     assert 0 < result.rays["shadow"] < hits
 
 
-def test_slow_variants_are_warned_of_once_in_a_process(run_python):
-    render = 'mrt.render(0, width=2, height=1, aa=1, variant="scalar_rgb")'
-    done = run_python(f"import mrt_mitsuba as mrt\n{render}\n{render}")
-    assert done.stderr.count("one ray at a time") == 1
-
-
 def test_rendering_leaves_no_scene_behind():
     """Integrator and scene must not own each other: Mitsuba's shapes would pile up in every later kernel."""
 

@@ -10,7 +10,6 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.validation import device
 
 VARIANTS = ("llvm_ad_rgb", "scalar_rgb")
-pytestmark = pytest.mark.filterwarnings("ignore:scalar_:mrt_mitsuba.MrtWarning")
 needs_llvm = pytest.mark.skipif(runtime.obstacle("llvm_ad_rgb") is not None, reason="no LLVM to run kernels")
 
 
