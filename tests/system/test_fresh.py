@@ -100,7 +100,7 @@ def test_a_prepared_scene_gives_what_render_gives(loaded):
     other = mi.load_dict(nodes)
     parameters = mi.traverse(other)
     keys = [key for key in parameters.keys() if key.endswith("reflectance.value")]  # noqa: SIM118
-    for seed, value in enumerate((0.0, 0.3, 0.4, 0.9)):
+    for seed, value in ((0, 0.0), (0, 0.3), (1, 0.4), (2, 0.9)):
         for key in keys:
             again.params[key] = parameters[key] = mi.Color3f(value, 0.5 * value, 0.2 * value)
         parameters.update()

@@ -134,6 +134,7 @@ OTHER_SHAPES = "other shapes, or spheres that emit or face inwards"
 OTHER_LIGHT = f"a light other than {names_in('lights')}, or one with derivatives"
 reason("bvh", "no shapes but analytic ones", a=CONE)
 reason("spheres", OTHER_SHAPES, a=SPHERE, b=MESH)
+reason("spheres", OTHER_SHAPES, a=SPHERE, b=LAMP)
 reason("spheres", "a material needs the frame along texture coordinates", a=BRUSHED_BALL)
 reason("light_buffers", OTHER_LIGHT, **CROWD, light={"type": "point"})
 reason("light_buffers", OTHER_SHAPES, **CROWD, light=LIGHT, b=MESH)

@@ -60,20 +60,21 @@ def update(scene: mi.Scene, name: str, value: Any) -> None:
 
 
 def test_light_buffers_follow_the_light_and_the_spheres():
-    """A floor under a ball, and so many others that there are lists of what is in the way of the light."""
+    """A floor under two balls, and so many others that there are lists of what is in the way of the light."""
     ours = {"bsdf": {"type": "mrt_bsdf"}}
     others = {f"s{i}": {"type": "sphere", "center": [i, 90, 0], "radius": 0.2, **ours} for i in range(70)}
     nodes = {"type": "scene", "integrator": {"type": "mrt_whitted"}}
     nodes["sensor"] = sensor([0, 0, 5], [0, 0, 0], (32, 24), fov=1)
     nodes["light"] = {"type": "mrt_light", "position": [4, 0, 8]}
     nodes["floor"] = {"type": "mrt_plane", "normal": [0, 0, 1], **ours}
-    nodes["ball"] = {"type": "sphere", "center": [2, 0, 4], "radius": 0.5, **ours}
+    for name, x in (("ball", 2), ("twin", -2)):
+        nodes[name] = {"type": "sphere", "center": [x, 0, 4], "radius": 0.5, **ours}
     scene = mi.load_dict(nodes | others)
     assert drawn(scene) == 0
     assert scene.integrator().prepare(scene).plan.light_buffers
     update(scene, "light.position", [-4, 0, 8])
-    assert drawn(scene) > 0.1
-    update(scene, "ball.to_world", mi.ScalarTransform4f().translate([-2, 0, 4]).scale(0.5))
     assert drawn(scene) == 0
-    update(scene, "light.position", [4, 0, 8])
+    update(scene, "twin.to_world", mi.ScalarTransform4f().translate([-2, 9, 4]).scale(0.5))
     assert drawn(scene) > 0.1
+    update(scene, "light.position", [4, 0, 8])
+    assert drawn(scene) == 0
