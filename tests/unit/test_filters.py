@@ -194,7 +194,7 @@ def test_a_blurred_foreground_covers_and_a_background_does_not():
     """What is sharp takes nothing from behind it; in the middle of a foreground nothing shows through."""
     image = np.zeros((41, 41, 3), np.float32)
     image[:, 20:] = 1
-    for first, second in ((3.0, 9.0), (9.0, 3.0)):  # the left half, the right one
+    for first, second in ((3.0, 9.0), (9.0, 3.0), (3.0, 3.5)):  # the left half, the right one
         depth = np.where(np.arange(41) < 20, first, second) * np.ones((41, 1))
         found = gaussian_dof(image, depth, focal_distance=first, focal_range=0, mode="corrected")[20, :, 0]
         assert_allclose(found[30:35], 1, atol=1e-6)
