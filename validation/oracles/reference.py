@@ -75,7 +75,7 @@ def reference_render(
 @np.errstate(all="ignore")
 def _radiance(scene: Scene, o: Array, d: Array, fresnel: str, clamp: bool) -> tuple[Array, Array]:
     """The light [N, 3] that comes back along rays, and the hashes of their decisions [N]."""
-    things = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
+    things: list[Any] = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
     materials = [thing.material for thing in things]
     numbers = np.array([*((m.ior, m.alpha, *m.specular) for m in materials), NOTHING])
     light = np.zeros(d.shape)
