@@ -77,7 +77,8 @@ def maps(result: Any) -> list[Figure]:
     figures = []
     for layer, title in MAPS.items():
         drawn, axes = panel(title, height=4.6 * height / width + 0.8)
-        shown = axes.imshow(result.layers[layer], norm="log")
+        values = result.layers[layer]
+        shown = axes.imshow(values.clip(np.quantile(values[values > 0], 0.05)), norm="log")
         drawn.colorbar(shown, location="bottom", fraction=0.05, pad=0.02)
         axes.set(xticks=[], yticks=[], anchor="N")
         axes.spines[:].set_visible(False)
