@@ -109,13 +109,17 @@ class Point:
 
     def row(self) -> Values:
         """Return the row of the table of all cases."""
-        row: Values = {"case": self.name, "seconds": self.seconds}
-        row |= {"interval, s": _interval(*self.seconds_interval), "cold, s": self.cold}
-        row |= {"RMSE": "not resolved", "interval": "", "|bias|": "", "interval of it": ""}
-        if self.resolved:
-            row |= {"RMSE": self.rmse, "interval": _interval(*self.rmse_interval)}
-            row |= {"|bias|": self.bias, "interval of it": _interval(*self.bias_interval)}
-        return row | {"1 / (variance × s)": self.efficiency}
+        return {
+            "case": self.name,
+            "seconds": self.seconds,
+            "interval, s": _interval(*self.seconds_interval),
+            "cold, s": self.cold,
+            "RMSE": self.rmse if self.resolved else "not resolved",
+            "interval": _interval(*self.rmse_interval) if self.resolved else "",
+            "|bias|": self.bias,
+            "interval of it": _interval(*self.bias_interval),
+            "1 / (variance × s)": self.efficiency,
+        }
 
 
 @dataclass(frozen=True)

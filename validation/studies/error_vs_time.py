@@ -136,7 +136,6 @@ def path(number: Number, cost: Cost) -> Findings:
             cases[f"direct, spp={spp}"] = {"integrator": "direct", "spp": spp}
     if number in CALM:
         cases["mrt_whitted"] = {}
-        cases["mrt_whitted, no clamp"] = {"integrator": {"type": "mrt_whitted", "clamp": False}}
     return error_vs_time(
         nodes,
         cases,
