@@ -172,12 +172,12 @@ def either(names: Sequence[str]) -> str:
     return " or ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else names[0]
 
 
-def option(default: Any, kind: Kind, text: str = "", shown: str | None = None, needs: str = "") -> Any:
+def option(default: Any, kind: Kind, text: str = "", shown: str | None = None) -> Any:
     """Declare a field of a table of options.
 
-    ``shown`` is the default as the help names it; ``needs`` another option, without which it is of no use.
+    ``shown`` is the default as the help names it.
     """
-    metadata = {"kind": kind, "help": text, "shown": shown, "needs": needs}
+    metadata = {"kind": kind, "help": text, "shown": shown}
     return dataclasses.field(default=default, metadata=metadata)
 
 

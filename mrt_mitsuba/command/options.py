@@ -120,12 +120,7 @@ def checked(filename: str, given: dict[str, Any]) -> Options:
     """Return options of the values that ``read_scene`` gives; raise ``UsageError`` for a wrong one."""
     values: dict[str, Any] = {"params": given.pop("params", None)}
     for name, text in given.items():
-        about = TABLE[name].metadata
-        needed = about["needs"]
-        if needed and needed not in given:
-            form = TABLE[needed].metadata["kind"].form
-            raise UsageError(f"{name} is of use only with {needed}={form.lower()}")
-        values[name] = check(name, about["kind"], text, text=isinstance(text, str))
+        values[name] = check(name, TABLE[name].metadata["kind"], text, text=isinstance(text, str))
     options = Options(filename=filename, **values)
     is_obj(options.scene, options.model())
     return options

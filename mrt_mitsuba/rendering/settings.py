@@ -159,9 +159,7 @@ class RenderSettings:
     motion: tuple[float, ...] | None = option(
         None, VECTOR._replace(form="DX,DY,DZ"), "motion blur: how far the camera moves", "none"
     )
-    motionsamples: int = option(
-        16, integer(1, 65536), "moments at which motion blur sees the scene", needs="motion"
-    )
+    motionsamples: int = option(16, integer(1, 65536), "moments at which motion blur sees the scene")
     convention: str = option("report", CONVENTION, "MTL files: Ni is the roughness, or the IOR")
     texturing: str | None = option(
         None,
