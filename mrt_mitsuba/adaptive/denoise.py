@@ -60,6 +60,7 @@ class Denoiser:
             normal,
             encode=stats.metric.encode,
             unfiltered=unfiltered,
+            refilter=stats.film.filtered_means,
             quality="fast",
         )
         plain = stats.image()[..., :3].astype(np.float32)

@@ -57,6 +57,7 @@ def denoise(
     *,
     encode: Encode | None = None,
     unfiltered: tuple[Image, Image] | None = None,
+    refilter: Callable[[Image], Image] | None = None,
     quality: Quality = "balanced",
 ) -> Denoised:
     """Denoise two independent renders of a picture, and mix the result with their mean where that errs less.
@@ -70,6 +71,7 @@ def denoise(
             values themselves.
         unfiltered: the means of the samples in each pixel of the two renders, [H, W, 3] each, which are
             denoised in their place; noise that a reconstruction filter has spread over pixels hardly is.
+        refilter: what the reconstruction filter makes of pixel means, applied to ``unfiltered`` ones denoised.
         quality: of Open Image Denoise; "fast" takes half the time of "balanced", and loses fine detail.
 
     Pixels that are not finite in a render are taken from the mean as they are, and count in no error.
@@ -91,6 +93,8 @@ def denoise(
     halves = [np.where(valid[..., None], half, 0) for half in halves]
     inputs = halves if unfiltered is None else [np.asarray(half, np.float32) for half in unfiltered]
     denoised = [_open_image_denoise(half, albedo, normal, quality) for half in inputs]
+    if refilter is not None:
+        denoised = [refilter(half) for half in denoised]
     estimates = _Estimates.of(halves, denoised, encode or np.asarray, valid)
     weight = estimates.best_weight()
     share = weight[..., None]

@@ -194,6 +194,21 @@ class Film:
         along = np.square(self.weights.mean(1)).sum() / np.square(self.weights).mean(1).sum()
         return float(along) ** 2
 
+    def filtered_means(self, means: np.ndarray) -> np.ndarray:
+        """Filter means over pixels, [H, W, channels]: by three taps along each axis, to the filter's width.
+
+        A mean over a pixel is wide already; the taps add the rest of the filter's second moment.
+        """
+        share = self.weights / self.weights.sum()
+        steps = self.weights.shape[1]
+        offset = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(steps) + 0.5) / steps - 0.5
+        beside = (float((share * offset**2).sum()) - 1 / 12) / 2
+        for axis in (0, 1) if self.reach else ():
+            padded = np.pad(means, [(int(axis == k),) * 2 for k in range(3)], mode="edge")
+            wide = sliding_window_view(padded, 3, axis)
+            means = wide[..., 1] + np.float32(beside) * (wide[..., 0] + wide[..., 2] - 2 * wide[..., 1])
+        return means
+
     def filtered_variance(self, variance: np.ndarray) -> np.ndarray:
         """Convolve the variance [..., H, W] of pixel means with the squared filter, up to a factor."""
         share = np.square(self.weights).sum(axis=1)
