@@ -86,7 +86,7 @@ def equal_time(quick: bool) -> Image.Image:
     truth = np.mean([theirs(scene, 64 if quick else 256, 100 + k) for k in range(8)], axis=0)
     options: dict[str, Any] = {"metric": "display", "denoise": True, "target": "1%", "progress": Progress()}
     for seed in range(3):  # the first one compiles its kernels
-        result, seconds = timed(mrt.render, scene, integrator="path", seed=seed, **options)
+        result, seconds = timed(mrt.render, scene, seed=seed, **options)
     rivals = []
     for sampler in SAMPLERS:
         loaded = load(sampler)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Quality = Literal["fast", "balanced", "high"]
 
-REACH = 4  # pixels to each side of the windows in which squared errors are averaged
+REACH = 8  # pixels to each side of the windows in which squared errors are averaged
 BLOCK = 8  # side, in pixels, of the blocks whose spread gives the interval of the error
 CORRELATED = 0.1  # correlation of the noise of two pixels above which they are not taken for independent
 MIN_SHARE = 0.3  # of the error that a pixel's noise makes typical: windows of few pixels may show none
@@ -168,12 +168,11 @@ class _Estimates:
         That of a pixel comes from its neighbours only, and not from those whose noise goes along with its
         own: so no noise decides the weight with which it counts in the error of the mixture.
         """
-        near = REACH if self.reach < 2 else 2 * REACH
-        counts = [window_counts(self.error.shape, reach) for reach in (near, self.reach)]
+        counts = [window_counts(self.error.shape, reach) for reach in (REACH, self.reach)]
 
         def around(values: np.ndarray) -> np.ndarray:
             inner = window_means(values, self.reach) if self.reach else values
-            total = window_means(values, near) * counts[0] - inner * counts[1]
+            total = window_means(values, REACH) * counts[0] - inner * counts[1]
             return np.asarray(total / np.maximum(counts[0] - counts[1], 1))
 
         variance = around(self.variance)

@@ -48,6 +48,21 @@ def test_noise_under_a_filter_has_its_variance_and_correlation(rfilter):
     assert_allclose(film.filtered_variance(alike), alike, rtol=1e-6)
 
 
+@pytest.mark.parametrize("rfilter", ["box", "tent", "gaussian", "mitchell"])
+def test_filtered_means_are_as_wide_as_the_filter(rfilter):
+    """A bright pixel keeps its sum, and its second moment with that of a pixel is the filter's."""
+    mrt.register()
+    film = Film(mi.load_dict(sensor([0, 0, 1], [0, 0, 0], (9, 9), rfilter=rfilter)))
+    means = np.zeros((9, 9, 1), np.float32)
+    means[4, 4] = 1
+    along = film.filtered_means(means)[..., 0].sum(0)
+    assert along.sum() == pytest.approx(1)
+    position = np.linspace(-4, 4, 10_001)
+    values = np.array(film.rfilter.eval(mi.Float(position.tolist()))) if film.reach else abs(position) < 0.5
+    expected = (values * position**2).sum() / values.sum()
+    assert (along * np.arange(-4, 5) ** 2).sum() + 1 / 12 == pytest.approx(expected, abs=2e-3)
+
+
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 def test_moments_of_a_canvas(variant, rfilter):
