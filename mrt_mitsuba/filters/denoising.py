@@ -71,7 +71,7 @@ def denoise(
             values themselves.
         unfiltered: the means of the samples in each pixel of the two renders, [H, W, 3] each, which are
             denoised in their place; noise that a reconstruction filter has spread over pixels hardly is.
-        refilter: what the reconstruction filter makes of pixel means, applied to ``unfiltered`` ones denoised.
+        refilter: what the reconstruction filter makes of pixel means; for ``unfiltered`` ones, denoised.
         quality: of Open Image Denoise; "fast" takes half the time of "balanced", and loses fine detail.
 
     Pixels that are not finite in a render are taken from the mean as they are, and count in no error.

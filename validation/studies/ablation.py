@@ -14,6 +14,7 @@ from scipy.stats import gmean
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.adaptive import allocate, estimate, rounds
+from mrt_mitsuba.plugins import plugin
 from mrt_mitsuba.validation.compare import Array, averaged
 from mrt_mitsuba.validation.scenery import KINDS, load_kind
 from mrt_mitsuba.validation.study import Study, Values
@@ -29,17 +30,26 @@ def _unsmoothed(variance: Array) -> Array:
     return np.sqrt(variance + 1e-30)
 
 
-ABLATIONS: dict[str, list[Change]] = {
-    "equal weights in the mixture": [(estimate, "_mixture", _equal_weights)],
-    "one window of 5 x 5": [(estimate, "WINDOWS", (2, 2))],
-    "no smoothing of deviations": [(allocate, "_smoothed", _unsmoothed)],
-    "PILOT_RATIO 1/24": [(allocate, "PILOT_RATIO", 1 / 24)],
-    "PILOT_RATIO 1/6": [(allocate, "PILOT_RATIO", 1 / 6)],
-    "GROWTH 8": [(rounds, "GROWTH", 8.0)],
-    "no MIN_RAYS": [(rounds, "MIN_RAYS", 0)],
-    "TARGET_MARGIN 1": [(rounds, "TARGET_MARGIN", 1.0)],
-    "no SAFETY": [(rounds, "SAFETY", 0.0)],
-}
+def ablations() -> dict[str, list[Change]]:
+    """What is changed, by the name of the stage that is left out."""
+    sequence = plugin("samplers", "mrt_mitsuba.adaptive").PixelSequence
+    return {
+        "equal weights in the mixture": [(estimate, "_mixture", _equal_weights)],
+        "WINDOWS 2": [(estimate, "WINDOWS", (2, 2))],
+        "UNSEEN_PSEUDOCOUNT 0": [(estimate, "UNSEEN_PSEUDOCOUNT", 0.0)],
+        "PRIOR_WEIGHT 1e-6": [(estimate, "PRIOR_WEIGHT", 1e-6)],
+        "MIN_CALIBRATION_RATIO 0": [(estimate, "MIN_CALIBRATION_RATIO", 0.0)],
+        "no smoothing of deviations": [(allocate, "_smoothed", _unsmoothed)],
+        "PILOT_RATIO 1/24": [(allocate, "PILOT_RATIO", 1 / 24)],
+        "PILOT_RATIO 1/6": [(allocate, "PILOT_RATIO", 1 / 6)],
+        "GROWTH 8": [(rounds, "GROWTH", 8.0)],
+        "MIN_GROWTH 1.01": [(rounds, "MIN_GROWTH", 1.01)],
+        "MIN_RAYS 0": [(rounds, "MIN_RAYS", 0)],
+        "MIN_RELATIVE_DEVIATION 0": [(rounds, "MIN_RELATIVE_DEVIATION", 0.0)],
+        "TARGET_MARGIN 1": [(rounds, "TARGET_MARGIN", 1.0)],
+        "SAFETY 0": [(rounds, "SAFETY", 0.0)],
+        "gain 0": [(sequence, "gain", 0.0)],
+    }
 
 
 TITLE = "What each stage of adaptive sampling brings"
@@ -58,21 +68,26 @@ def ablate(study: Study, *, size: int, rays: int, seeds: int, kinds: Sequence[st
     scenes = {kind: load_kind(kind, size) for kind in kinds}
     truths = {kind: truth(scene, rays) for kind, scene in scenes.items()}
     base: dict[str, tuple[float, float]] = {}
+    changed = {"as it is": list[Change]()} | ablations()
     rows: list[Values] = []
-    for name in study.each("Ablation", ["as it is", *ABLATIONS]):
+    for name in study.each("Ablation", list(changed)):
         row: Values = {"stage": name}
+        errors, tenths = list[float](), list[float]()
         for kind, scene in scenes.items():
             with ExitStack() as changes:
-                for change in ABLATIONS.get(name, []):
+                for change in changed[name]:
                     changes.enter_context(patch.object(*change))
-                spent, square, off = measured(scene, *truths[kind], seeds)
+                spent, square, off, tenth = measured(scene, *truths[kind], seeds)
             base.setdefault(kind, (spent, square))
             row[kind] = spent * square / (base[kind][0] * base[kind][1])
-            row[f"{kind}: error"] = off
+            errors.append(off)
+            tenths.append(tenth)
         row["mean"] = float(gmean([row[kind] for kind in scenes]))
+        row |= {"worst error": max(errors), "worst tenth": max(tenths)}
         rows.append(row)
     note = (
-        "Rays times squared error, over those of the sampler as it is; error: median true error over target."
+        "Rays times squared error, over those of the sampler as it is; worst error: true over target, the "
+        "median of the worst kind; worst tenth: factor between pixels' true and stated errors, sorted by these."
     )
     study.records("ablation", f"Ablation, {size}x{size}, the error of {rays} rays", rows, note)
     least = min(rows[1:], key=lambda row: float(row["mean"]))
@@ -88,11 +103,19 @@ def truth(scene: Any, rays: int) -> tuple[Array, float, float]:
     return mean, float(noise.mean()), float(np.sqrt(left))
 
 
-def measured(scene: Any, true: Array, noise: float, target: float, seeds: int) -> tuple[float, float, float]:
-    """Mean rays of a pixel, mean squared error, and the median of error over target."""
+def measured(
+    scene: Any, true: Array, noise: float, target: float, seeds: int
+) -> tuple[float, float, float, float]:
+    """Mean rays of a pixel, mean squared error, the median of error over target, and the factor between true
+    and stated errors in the worst tenth of the pixels, sorted by the latter."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mrt.MrtWarning)
         results = [mrt.render(scene, target=target, seed=seed) for seed in range(seeds)]
-    squares = np.array([max(np.square(result.image - true).mean() - noise, 1e-12) for result in results])
+    errors = np.array([np.square(result.image - true).mean(-1) for result in results])
+    squares = np.maximum(errors.mean((1, 2)) - noise, 1e-12)
+    stated = np.array([result.layers["error.Y"] for result in results]).reshape(errors.shape)
+    tenths = np.array_split(np.argsort(stated, axis=None), 10)
+    ratios = [errors.ravel()[tenth].mean() / np.square(stated.ravel()[tenth]).mean() for tenth in tenths]
     spent = float(np.mean([result.rounds[-1].spp for result in results]))
-    return spent, float(squares.mean()), float(np.median(np.sqrt(squares))) / target
+    middle = float(np.median(np.sqrt(squares))) / target
+    return spent, float(squares.mean()), middle, float(np.exp(np.abs(np.log(ratios)).max() / 2))
