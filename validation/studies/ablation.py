@@ -87,7 +87,7 @@ def ablate(study: Study, *, size: int, rays: int, seeds: int, kinds: Sequence[st
         rows.append(row)
     note = (
         "Rays times squared error, over those of the sampler as it is; worst error: true over target, the "
-        "median of the worst kind; worst tenth: factor between pixels' true and stated errors, sorted by these."
+        "median of the worst kind; worst tenth: of pixels by stated error, the factor to the true one."
     )
     study.records("ablation", f"Ablation, {size}x{size}, the error of {rays} rays", rows, note)
     least = min(rows[1:], key=lambda row: float(row["mean"]))
