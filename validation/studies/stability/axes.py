@@ -133,13 +133,16 @@ def grazing(cosine: float, count: int) -> Curves:
     return lobes(np.full(count, cosine), 0.3)
 
 
+def reflectances(cosines: Array, iors: Array) -> Curves:
+    """Measure Fresnel's reflectance for cosines and indices of refraction [N], float32."""
+    truth = [float(exact.fresnel_dielectric(c, 1, n)) for c, n in zip(cosines, iors, strict=True)]
+    ours = fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors))
+    return _off(ours, mi.fresnel(mi.Float(cosines), mi.Float(iors))[0], np.array(truth))
+
+
 def index(above: float, count: int) -> Curves:
     """Measure Fresnel's reflectance at an index of refraction, given as its excess over 1."""
-    n = np.float32(1 + above)
-    c = np.linspace(0.02, 1, count, dtype=np.float32)
-    truth = [float(exact.fresnel_dielectric(cosine, 1, n)) for cosine in c]
-    ours = fresnel.fresnel_dielectric(mi.Float(c), 1, mi.Float(n))
-    return _off(ours, mi.fresnel(mi.Float(c), mi.Float(n))[0], np.array(truth))
+    return reflectances(np.linspace(0.02, 1, count, dtype=np.float32), np.full(count, 1 + above, np.float32))
 
 
 # -------------------------------------------- Geometry --------------------------------------------

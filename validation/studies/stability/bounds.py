@@ -6,16 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from numpy.linalg import norm
 
-from mrt_mitsuba.plugins import fresnel
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.laws.bsdf import check_bsdf
-from mrt_mitsuba.validation.oracles import exact
 from mrt_mitsuba.validation.oracles.reference import reference_render, unit
 from mrt_mitsuba.validation.studies.stability import axes
 from mrt_mitsuba.validation.study import Values
@@ -54,15 +51,16 @@ def reflectance(quick: bool) -> Iterator[Case]:
         found = axes.lobes(10 ** rng.uniform(-7, 0, count), alpha, STEEPEST)[axes.OURS]
         yield Case(f"value, alpha {alpha:g}", where, why, found.max() * axes.ROUNDING, 2e-5)
     cosines = np.float32(10 ** rng.uniform(-7, 0, count * len(IORS)))
-    worst = fresnel_error(cosines, np.repeat(IORS, count))
-    yield Case("F, largest", "cosines 1e-7 … 1, IOR 1e-3 … 1e6", "a few roundings", worst, 2e-6)
+    error = axes.reflectances(cosines, np.repeat(IORS, count))[axes.OURS].max() * axes.ROUNDING
+    yield Case("F, largest", "cosines 1e-7 … 1, IOR 1e-3 … 1e6", "a few roundings", error, 2e-6)
     # where total reflection begins, F ends in a square root: errors are those of g = 0
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
     critical = np.float32(np.sqrt((1 - np.float64(iors)) * (1 + np.float64(iors))))
     cosines = (critical.view(np.int32) + np.tile(np.arange(-40, 41, dtype=np.int32), 4)).view(np.float32)
     what = "the 40 float32 cosines on either side of it, IOR 0.5 … 0.9999"
     why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
-    yield Case("F at the critical angle", what, why, fresnel_error(cosines, iors), 16 * 2.0**-12)
+    error = axes.reflectances(cosines, iors)[axes.OURS].max() * axes.ROUNDING
+    yield Case("F at the critical angle", what, why, error, 16 * 2.0**-12)
     what = "laws of finite values that fail, indices 1 + 1e-7 … 1e6"
     for alpha in EXTREME:
         bsdfs = [
@@ -71,13 +69,6 @@ def reflectance(quick: bool) -> Iterator[Case]:
         ]
         failed = sum(len(check_bsdf(bsdf, quick=True, only=["finite"]).failed) for bsdf in bsdfs)
         yield Case(f"finite, alpha {alpha:g}", what, "no value is NaN, infinite or negative", failed, 0)
-
-
-def fresnel_error(cosines: np.ndarray, iors: np.ndarray) -> float:
-    """Return the largest relative error of the dielectric term."""
-    truth = [float(exact.fresnel_dielectric(c, 1, n)) for c, n in zip(cosines, iors, strict=True)]
-    found = np.array(fresnel.fresnel_dielectric(mi.Float(cosines), 1, mi.Float(iors)), np.float64)
-    return float(abs(found / truth - 1).max())
 
 
 # ---------------------------------------------- Light paths ----------------------------------------------
@@ -159,32 +150,27 @@ SHARE_MOVED = 1e-4
 
 
 def placements(quick: bool) -> Iterator[Case]:
-    """Yield the share of pixels that change where the report's scenes are scaled, and moved."""
+    """Yield the share of pixels that change where the report's scenes are scaled, or moved by their sizes."""
+    what = "share of pixels off by more than 2/255"
+    why = "coordinates have steps of 2⁻²³ of that distance: normals and outlines move"
     # Scene 2 shows the horizon, which a far plane can cut off
     for number in (0, 2) if quick else range(5):
-        yield from scaled_and_moved(replace(report_scene(number), focal_distance=None), f"scene {number}")
+        scene = replace(report_scene(number), focal_distance=None)
+        name = f"scene {number}"
+        for factor in (1e-6, 1e-3, 1e3, 1e6):
+            off = changed(scene, factor, 0)
+            yield Case(f"{name} times {factor:g}", what, "the same picture", off, SHARE_SCALED)
+        for sizes in (1.0, 10.0, 100.0, 1e3, 1e4):
+            # Very far away, float32 has no digits left for the scene
+            most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
+            yield Case(f"{name} moved by {sizes:g} sizes", what, why, changed(scene, 1, sizes), most)
 
 
-def scaled_and_moved(scene: Scene, name: str) -> Iterator[Case]:
-    """Yield the share of pixels that change where a scene is scaled, and moved by multiples of its size."""
-
-    def picture(scene: Scene) -> np.ndarray:
-        return render(scene, width=120, height=90, aa=1, aamode="none").image  # [H, W, 3]
-
-    base = picture(scene)
-
-    def changed(factor: float, sizes: float) -> float:
-        off = abs(picture(placed(scene, factor, sizes)) - base).max(axis=-1)
-        return float(np.mean(~(off <= VISIBLE)))  # NaN is off
-
-    what = "share of pixels off by more than 2/255"
-    for factor in (1e-6, 1e-3, 1e3, 1e6):
-        yield Case(f"{name} times {factor:g}", what, "the same picture", changed(factor, 0), SHARE_SCALED)
-    why = "coordinates have steps of 2⁻²³ of that distance: normals and outlines move"
-    for sizes in (1.0, 10.0, 100.0, 1e3, 1e4):
-        # Very far away, float32 has no digits left for the scene
-        most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
-        yield Case(f"{name} moved by {sizes:g} sizes", what, why, changed(1, sizes), most)
+def changed(scene: Scene, factor: float, sizes: float) -> float:
+    """Return the share of pixels that change where a scene is placed elsewhere."""
+    scenes = (scene, placed(scene, factor, sizes))
+    before, after = (render(one, width=120, height=90, aa=1, aamode="none").image for one in scenes)
+    return float(np.mean(~(abs(after - before).max(axis=-1) <= VISIBLE)))  # NaN is off
 
 
 def placed(scene: Scene, factor: float, sizes: float) -> Scene:
