@@ -145,9 +145,11 @@ def test_a_second_run_renders_only_what_is_missing_or_was_made_otherwise(address
     second = run()
     made_again = {name for name in first if first[name] != second[name]}
     assert made_again == {"seed=1.exr"}
-    for other in ({"fresnel": "dielectric"}, {"aa": 2}, {"aa": 2, "resume": False}):
+    others: dict[str, Any] = {}
+    for name, value in (("fresnel", "dielectric"), ("aa", 2), ("resume", False)):
+        others[name] = value
         before = made(tmp_path)
-        assert not set(before.values()) & set(run(**other).values())
+        assert not set(before.values()) & set(run(**others).values())
 
 
 def test_pictures_of_another_version_are_made_again(address, tmp_path, monkeypatch):
