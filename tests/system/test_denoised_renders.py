@@ -32,6 +32,7 @@ def test_the_noisy_mean_is_that_without_denoising(calm):
     assert weight.min() >= 0 and weight.max() <= 1
     assert_array_equal(found.image[weight == 0], noisy[weight == 0])
     assert found.error.rmse < 0.9 * plain.error.rmse
+    assert np.sqrt(np.mean(found.layers["error.Y"] ** 2)) == pytest.approx(found.error.rmse, rel=0.05)
     assert "denoised" in str(found.plan)
     assert_array_equal(mrt.render(calm, denoise=True, spp=64).image, found.image)
 

@@ -154,9 +154,10 @@ def test_a_film_may_be_smaller_than_a_chessboard(size, rfilter, goal):
         assert result.rounds[-1].spp >= 8
 
 
-def test_a_header_says_that_an_error_has_no_upper_end():
+@pytest.mark.parametrize("options", [{"aamode": "noise"}, {"denoise": True}], ids=str)
+def test_a_header_says_that_an_error_has_no_upper_end(options):
     with pytest.warns(mrt.MrtWarning, match="a few rays dominate the error"):
-        result = mrt.render(camera(24, 16), integrator=noise(rare=0.0005), aamode="noise", spp=64, seed=1)
+        result = mrt.render(camera(24, 16), integrator=noise(rare=0.0005), spp=64, seed=1, **options)
     assert result.error.high == math.inf
     assert result.header()["mrt:error"]["high"] is None
 
