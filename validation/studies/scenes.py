@@ -24,21 +24,19 @@ REASONS = ("edge", "steep shading", "unexplained")
 MOST = (5e-7, 1e-5, 1.5e-5, 3e-6, 3e-5, 1e-6, 6e-7, 5e-7, 3e-7, 9e-7)
 
 
-def judge(
-    image: np.ndarray, scene: Scene, *, displacement: float = DISPLACEMENT
-) -> tuple[np.ndarray, np.ndarray]:
+def judge(image: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Judge a linear picture [H, W, 3] with one sample a pixel and the exact Fresnel factor.
 
     Return the error [H, W], the largest difference in a channel; and the reason [H, W], an index in
     ``REASONS`` where the error exceeds a step of an 8-bit picture, else -1. Such a pixel is on an edge, of a
-    silhouette or a shadow, if a ray moved by ``displacement`` pixels meets other things or other lights; on
+    silhouette or a shadow, if a ray moved by ``DISPLACEMENT`` pixels meets other things or other lights; on
     steep shading if that changes its colour by as much; or unexplained.
     """
     size = {"height": image.shape[0], "width": image.shape[1]}
     truth = reference_render(scene, **size)
     error = abs(image - truth.image).max(axis=-1)
     off = ~(error <= STEP)
-    steps = [(displacement, 0), (-displacement, 0), (0, displacement), (0, -displacement)]
+    steps = DISPLACEMENT * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
     moved = [reference_render(scene, displacement=step, **size) for step in steps if off.any()]
     edge = np.any([other.decisions != truth.decisions for other in moved], axis=0)
     spread = np.max([abs(other.image - truth.image).max(axis=-1) for other in moved], axis=0, initial=0)

@@ -38,11 +38,11 @@ Curves = dict[str, Array]  # roundings [places] by ``OURS``, ``THEIRS``
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis along which something gets hard."""
+    """An axis along which a figure gets hard to compute."""
 
     title: str
     label: str  #: of the axis
-    nearest: str  #: what of Mitsuba's comes nearest
+    nearest: str  #: Mitsuba's closest plugin
     ends: tuple[float, float]  #: exponents of ten
     measure: Callable[[float, int], Curves]  #: figures [samples] of one place, from the number of samples
     limit: float  #: that ours is promised to stay below, in roundings
@@ -63,8 +63,8 @@ def show(study: Study, *, quick: bool, places: int = 0) -> None:
     """Add the diagram of all axes and its table to a study, and hold ours to its promised limit."""
     rows = []
     caption = (
-        "Roundings of float32 (6e-8). Blue: ours. Orange: what of Mitsuba's comes nearest. At the top, no "
-        "digit is right."
+        "Roundings of float32 (6e-8). Blue: ours. Orange: Mitsuba's closest plugin. At the top, no digit "
+        "is right."
     )
     for number, axis in enumerate(study.each("Axes", AXES)):
         x, lines = curves(axis, places=places or (9 if quick else 33), count=24 if quick else 96)
@@ -73,7 +73,7 @@ def show(study: Study, *, quick: bool, places: int = 0) -> None:
         why = "the limit of the tables below, in roundings; worst place of this axis"
         study.at_most(f"roundings of the {title}", ours, axis.limit, why)
         row = {"what": axis.title, "along": axis.label, "promised": axis.limit, "ours, worst": ours}
-        row |= {f"{THEIRS}, worst": lines[THEIRS].max(), "nearest of Mitsuba's": axis.nearest}
+        row |= {f"{THEIRS}, worst": lines[THEIRS].max(), "Mitsuba's closest plugin": axis.nearest}
         rows.append(row)
         study.picture(f"roundings {number}", title, roundings(axis, x, lines), "" if number else caption)
     note = f"One rounding is 2⁻²⁴. {WORST:.0%} of the samples of a place stay below its figure."
@@ -95,7 +95,7 @@ def roundings(axis: Axis, x: Array, lines: Curves) -> Figure:
 
 @np.errstate(all="ignore")  # what has no digit left may be NaN
 def _off(ours: object, theirs: object, truth: Array) -> Curves:
-    """Relative errors in roundings; as many as there can be for values that are no numbers."""
+    """Return relative errors in roundings; NaN and infinity count as ``NONE_RIGHT``."""
     errors = {}
     for name, value in ((OURS, ours), (THEIRS, theirs)):
         error = abs(np.asarray(value, np.float64) / truth - 1) / ROUNDING
