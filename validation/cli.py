@@ -88,7 +88,7 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool, ablate: bool = 
     studies = []
     for name in names:
         study = Study(name, name, TerminalProgress(unit="step"))
-        run_study(study, "ablation" if ablate and name == "adaptive" else name, quick=quick)
+        run_study(study, quick=quick, ablate=ablate)
         print(study, flush=True)
         studies.append(study)
     save_report(out, *studies, quick=quick)
@@ -96,7 +96,7 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool, ablate: bool = 
     return all(study.passed for study in studies)
 
 
-def run_study(study: Study, module_name: str, *, quick: bool) -> None:
+def run_study(study: Study, *, quick: bool, ablate: bool = False) -> None:
     """Run a study, with its title, failure and seconds."""
     import drjit as dr
 
@@ -105,7 +105,8 @@ def run_study(study: Study, module_name: str, *, quick: bool) -> None:
     start = time.perf_counter()
     try:
         runtime.use(runtime.default_variant())
-        module = import_module(f"mrt_mitsuba.validation.studies.{module_name.replace('-', '_')}")
+        name = "ablation" if ablate and study.name == "adaptive" else study.name.replace("-", "_")
+        module = import_module(f"mrt_mitsuba.validation.studies.{name}")
         study.title = module.TITLE
         print(f"{study.name}: {study.title} ...", file=sys.stderr, flush=True)
         module.run(study, quick=quick)

@@ -34,8 +34,16 @@ class Original:
     layers: dict[str, np.ndarray]  #: float32 [H, W] by channel
 
     def like(self, picture: np.ndarray) -> np.ndarray:
-        """Shorten a whole picture [H, W, 3] in the same way, so that both lose the same to rounding."""
-        return shortened(picture, self.window, self.block, self.bits)
+        """Shorten a whole picture [H, W, 3] in the same way, so that both lose the same to rounding.
+
+        A window of it, as the means of its blocks, rounded to a number of significant bits.
+        """
+        x, y, width, height = self.window
+        side = self.block
+        part = np.float64(picture[y : y + height, x : x + width])
+        part = part.reshape(height // side, side, width // side, side, -1).mean(axis=(1, 3))
+        digits, exponent = np.frexp(part)
+        return np.ldexp(np.round(digits * 2.0**self.bits), exponent - self.bits).astype(np.float32)
 
 
 def read_original(path: str | os.PathLike[str]) -> Original:
@@ -53,15 +61,6 @@ def read_original(path: str | os.PathLike[str]) -> Original:
         bits=int(picture.header.get("mrt:bits", EXACT)),
         layers=dict(picture.layers),
     )
-
-
-def shortened(picture: np.ndarray, window: tuple[int, int, int, int], block: int, bits: int) -> np.ndarray:
-    """Return a window of a picture, as the means of its blocks, rounded to a number of significant bits."""
-    x, y, width, height = window
-    part = np.float64(picture[y : y + height, x : x + width])
-    part = part.reshape(height // block, block, width // block, block, -1).mean(axis=(1, 3))
-    digits, exponent = np.frexp(part)
-    return np.ldexp(np.round(digits * 2.0**bits), exponent - bits).astype(np.float32)
 
 
 def side_by_side(folder: str | os.PathLike[str]) -> tuple[Figure, list[dict[str, Any]]]:
