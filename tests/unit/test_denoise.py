@@ -11,6 +11,7 @@ from cases import Cases
 from numpy.testing import assert_array_equal
 
 from mrt_mitsuba import UsageError, filters
+from mrt_mitsuba.filters import denoising
 from mrt_mitsuba.filters.grid import window_means
 
 SIZE = 96
@@ -67,7 +68,7 @@ def test_the_error_of_a_known_denoiser(monkeypatch):
     def halved(color, *features):
         return ((color + SMOOTH) / 2).astype(np.float32)
 
-    monkeypatch.setattr(sys.modules["mrt_mitsuba.filters.denoising"], "_open_image_denoise", halved)
+    monkeypatch.setattr(denoising, "_open_image_denoise", halved)
     found = filters.denoise(noisy(SMOOTH, 0, 0.02), noisy(SMOOTH, 1, 0.02))
     assert found.weight.min() > 0.99
     assert found.rmse == pytest.approx(rms(found.image - SMOOTH), rel=0.03)
@@ -121,8 +122,7 @@ def test_what_a_screen_clips_counts_only_as_it_is_shown():
 
 def test_no_pixel_decides_its_own_weight(monkeypatch):
     """That of its neighbours it does: so the stated error of the mixture is honest."""
-    module = sys.modules["mrt_mitsuba.filters.denoise"]
-    monkeypatch.setattr(module, "_open_image_denoise", lambda *_: np.float32(SMOOTH + 0.07))
+    monkeypatch.setattr(denoising, "_open_image_denoise", lambda *_: np.float32(SMOOTH + 0.07))
     halves = [noisy(SMOOTH, seed, 0.1) for seed in range(2)]
     before = filters.denoise(*halves).weight
     halves[0][50, 50] += 1
