@@ -79,7 +79,7 @@ def error_against_time() -> Answer:
 def hard_axes() -> Answer:
     """Where float32 breaks formulas."""
     mrt.register()
-    found = findings(axes.show, quick=True, places=3 if pages.QUICK else 21)
+    found = findings(axes.show, quick=True)
     plots, rows = _shown(found, "roundings")
     ours = max(_worst(rows, "ours"))
     theirs = sum(figure > 1000 for figure in _worst(rows, "Mitsuba"))

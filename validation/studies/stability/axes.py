@@ -48,26 +48,23 @@ class Axis:
     limit: float  #: that ours is promised to stay below, in roundings
 
 
-def curves(axis: Axis, *, places: int, count: int) -> tuple[Array, Curves]:
-    """Places on an axis, and the roundings that nearly all samples stay below there."""
-    x = np.logspace(*axis.ends, places)
-    rows = [axis.measure(float(place), count) for place in x]
-    worst = {}
-    for name in (OURS, THEIRS):
-        quantiles = [np.quantile(row[name], WORST, method="lower") for row in rows]
-        worst[name] = np.clip(quantiles, LEAST, NONE_RIGHT)
-    return x, worst
+def show(study: Study, *, quick: bool) -> None:
+    """Add the diagram of all axes and its table to a study, and hold ours to its promised limit.
 
-
-def show(study: Study, *, quick: bool, places: int = 0) -> None:
-    """Add the diagram of all axes and its table to a study, and hold ours to its promised limit."""
+    They show the roundings that nearly all samples of a place stay below.
+    """
     rows = []
     caption = (
         "Roundings of float32 (6e-8). Blue: ours. Orange: Mitsuba's closest plugin. At the top, no digit "
         "is right."
     )
     for number, axis in enumerate(study.each("Axes", AXES)):
-        x, lines = curves(axis, places=places or (9 if quick else 33), count=24 if quick else 96)
+        x = np.logspace(*axis.ends, 13 if quick else 33)
+        samples = [axis.measure(place, 24 if quick else 96) for place in x.tolist()]
+        lines = {}
+        for side in (OURS, THEIRS):
+            quantiles = [np.quantile(row[side], WORST, method="lower") for row in samples]
+            lines[side] = np.clip(quantiles, LEAST, NONE_RIGHT)
         ours = lines[OURS].max()
         title = f"{axis.title} along the {axis.label}"
         why = "the limit of the tables below, in roundings; worst place of this axis"
