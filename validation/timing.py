@@ -12,7 +12,6 @@ import numpy as np
 from mrt_mitsuba.rendering.progress import Progress
 
 Item = TypeVar("Item")
-Render = Callable[..., object]
 
 
 def in_turns(sides: Sequence[Callable[[int], Item]], turns: int) -> list[list[Item]]:
@@ -50,7 +49,7 @@ def ratio_of(seconds: Sequence[float], others: Sequence[float]) -> dict[str, flo
     return {**medians, "ratio": middle, "low": low, "high": high}
 
 
-def operations(render: Render) -> list[int]:
+def operations(render: Callable[..., object]) -> list[int]:
     """Return the length of the code of each distinct kernel of a ``mrt.render``."""
     lengths: dict[Any, int] = {}
 

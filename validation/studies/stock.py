@@ -110,16 +110,12 @@ def mistakes(nodes: Values) -> dict[str, Values]:
     def brighter(color: Values) -> Values:
         return color | {"value": [1.02 * x for x in color["value"]]}
 
-    def schlick(_: str) -> str:
-        return "schlick"
-
     sphere = nodes["sphere_0"] | {"flip_normals": True}
     return {
         "radiance x 1.02": changed(nodes, "specular_reflectance", brighter),
         "alpha x 1.05": changed(nodes, "alpha", partial(mul, 1.05)),
         "flipped normal of one sphere": nodes | {"sphere_0": sphere},
         "dropped light": {name: node for name, node in nodes.items() if name != "light_1"},
-        "schlick for dielectric": changed(nodes, "fresnel", schlick),
     }
 
 
