@@ -181,6 +181,17 @@ def test_a_file_of_the_users_own_is_refused_by_name(address, tmp_path, name):
     assert mine.read_bytes() == before
 
 
+def test_a_picture_that_the_scene_reads_is_not_replaced(address, tmp_path):
+    mrt.sweep(3, tmp_path, cluster=address, focaldist=0, **SMALL)
+    before = made(tmp_path)
+    nodes = mrt.scene_dict(3)
+    texture = {"type": "bitmap", "filename": str(tmp_path / "picture.exr")}
+    nodes["painted"] = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    (row,) = mrt.sweep(nodes, tmp_path, cluster=address, **SMALL).failed
+    assert "is made from this file" in row["error"]
+    assert made(tmp_path) == before
+
+
 # What each worker runs first: it changes a scene file that it has rendered
 CHANGES = """
 from mrt_mitsuba.rendering import api
@@ -286,6 +297,8 @@ def test_jobs_that_fail_or_cost_their_worker_spoil_no_other(mortal, tmp_path):
     assert not left_over(out)
     assert str(table).startswith("5 of 8 pictures")
     assert all(row["file"] == "" for row in table.failed)
+    with pytest.raises(UsageError, match="5 of 8 pictures are there: run the sweep again"):
+        table.mean()
 
 
 @pytest.mark.parametrize(

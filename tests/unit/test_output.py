@@ -357,6 +357,8 @@ def test_what_a_user_keeps_can_be_pickled():
     again = pickle.loads(pickle.dumps(result))
     assert again.image.tobytes() == result.image.tobytes()
     assert again.header() == result.header()
+    shown = Image.open(io.BytesIO(again._repr_png_()))  # in a notebook
+    assert_array_equal(shown, output.to_8bit(result.image, "srgb"))
 
 
 @pytest.mark.parametrize(("compression", "least", "most"), [("zip", 0, 0.5), ("none", 1, 1.1)])
