@@ -277,7 +277,7 @@ def _p_of_means(difference: Array) -> float:
         share = np.minimum(cell_sums(blocks, size) ** 2 / most, 1 - 1e-15)
         t = np.sqrt((pixels - 1) * share / (1 - share)).max((1, 2, 3))
         t[0] *= inside / wide
-        p = 2 * stats.t.sf(t, max(pixels.max() - 1, 1))
+        p = stats.t.sf(t, max(pixels.max() - 1, 1))  # of one side: only compared with each other
         least = np.minimum(least, p * max(np.count_nonzero(squares), 1))
     surprise = -np.log(least + 1e-300)
     others = np.sort(surprise[1:])[::-1]
