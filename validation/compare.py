@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -59,7 +58,7 @@ class Difference:
     largest: float  #: largest absolute error of a channel
     place: tuple[int, int]  #: row and column of the largest error
     p_value: float | None  #: of as much difference by noise alone; None where no noise is known
-    difference: Array  #: a − b, float32 [H, W, C]
+    difference: Array = field(repr=False)  #: a − b, float32 [H, W, C]
     pictures: tuple[Array, Array] = field(repr=False)
     inputs: tuple[str, ...] = ()  #: paths of the files that were compared
 
@@ -119,9 +118,6 @@ class Difference:
 
     def __str__(self) -> str:
         return self.text()
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(str(self))}</pre>"
 
 
 def compare(a: Picture, b: Picture, layer: str = "") -> Difference:

@@ -18,8 +18,6 @@ from mrt_mitsuba.validation import plotting
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-EXACT = 24  # significant bits of a float32
-
 
 @dataclass(frozen=True)
 class Original:
@@ -58,7 +56,7 @@ def read_original(path: str | os.PathLike[str]) -> Original:
         options=options,
         window=(x, y, width, height),
         block=int(picture.header.get("mrt:block", 1)),
-        bits=int(picture.header.get("mrt:bits", EXACT)),
+        bits=int(picture.header.get("mrt:bits", 24)),  # of a float32
         layers=dict(picture.layers),
     )
 

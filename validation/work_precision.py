@@ -41,7 +41,6 @@ RESOLVED = 2.0  # an error is known from this many times the reference's own err
 ERRORS = 4  # number of errors for which the time is given
 MAX_DOUBLINGS = 8  # of the rays of reference="auto"
 MIN_RMSE = 1e-15  # a smaller one is 0, which has no logarithm
-LEVEL = 0.95  # of all intervals
 
 Options = Mapping[str, Any]
 Given = Any  # a scene, as ``render`` takes it, or a reference
@@ -235,12 +234,12 @@ class Findings:
 
 
 def _reach(values: Array) -> float:
-    """How far Student's interval goes to each side of the mean of values; NaN of a single one."""
+    """How far Student's interval of 95 % goes to each side of the mean of values; NaN of a single one."""
     from scipy import stats
 
     if len(values) < 2:
         return math.nan
-    return float(stats.t.ppf((1 + LEVEL) / 2, len(values) - 1) * stats.sem(values))
+    return float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
 
 
 def _crossing(seconds: Array, errors: Array, error: float) -> float:

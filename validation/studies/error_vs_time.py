@@ -64,7 +64,7 @@ def run(study: Study, *, quick: bool) -> None:
     jobs = [(name, number) for name in MEASURED for number in ((0,) if quick else SCENES[name])]
     for name, number in study.each("Error against time", jobs):
         found = MEASURED[name](number, QUICK if quick else Cost())
-        describe(study, found, f"{title_of(number)}: {TITLES[name]}", f"{title_of(number).lower()}, {name}")
+        describe(study, found, f"{title_of(number)}: {TITLES[name]}", f"{title_of(number)}, {name}")
         del found  # what it holds is freed with it
 
 
