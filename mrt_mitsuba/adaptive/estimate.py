@@ -29,7 +29,6 @@ HALVES, PILOTS = [0, 1], [2, 3]
 WINDOWS = (2, 8)  # radii of the windows that pixels borrow variance from, in pixels
 UNSEEN_PSEUDOCOUNT = 0.25  # noisy pixels that are assumed to be among the others, unseen
 PRIOR_WEIGHT = 2  # squared errors that an estimated variance counts as much as
-MIN_CALIBRATION_RATIO = 0.05  # of measured to estimated squared errors: rare ones may be missing
 SUBSET_PIXELS = 2**12  # pixels, about, from which mixtures, quantiles and factors are found
 NOISE_FIELDS = 16  # pictures of noise that are blurred to estimate the variance after a blur
 LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB
@@ -440,4 +439,4 @@ def _calibration(estimated: np.ndarray, measured: np.ndarray) -> float:
         return 1.0
     number = effective_number(measured)
     ratio = measured.sum(dtype=np.float64) / whole
-    return float(max(ratio, MIN_CALIBRATION_RATIO) ** (number / (number + PRIOR_WEIGHT)))
+    return float(ratio ** (number / (number + PRIOR_WEIGHT)))
