@@ -86,7 +86,8 @@ def write_xml(
 
 
 def _put_into_files(nodes: Node, stem: str, flavor: str) -> dict[str, bytes]:
-    """Replace meshes by readers of binary PLY files; return the files by their paths."""
+    """Replace meshes by readers of binary PLY files, and textures in memory by those of EXR files; return
+    the files by their paths."""
     import mitsuba as mi
 
     files: dict[str, bytes] = {}
@@ -105,4 +106,11 @@ def _put_into_files(nodes: Node, stem: str, flavor: str) -> dict[str, bytes]:
             files[file] = stream.raw_buffer()
             flat = {"face_normals": True} if kind == "mrt_mesh" and "normals" not in node else {}
             nodes[name] = {"type": "ply", "filename": os.path.basename(file), **flat, "bsdf": bsdf}
+        elif kind == "mrt_bsdf" and "bitmap" in node["diffuse_reflectance"]:
+            file = f"{stem}_{name}.exr"
+            stream = mi.MemoryStream()
+            texture = node["diffuse_reflectance"]
+            texture.pop("bitmap").write(stream, mi.Bitmap.FileFormat.OpenEXR)
+            files[file] = stream.raw_buffer()
+            texture["filename"] = os.path.basename(file)
     return files

@@ -81,6 +81,17 @@ def find(name: str, folders: list[Path]) -> Path | None:
     return Path(found) if found else None
 
 
+def has_alpha(path: StrPath) -> bool:
+    """True if a picture is transparent somewhere."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            return picture.convert("RGBA").getextrema()[3][0] < 255
+    except Exception:  # whatever the library raises on broken files; reading the texture reports it
+        return False
+
+
 def warn_of(findings: Mapping[str, list[str]]) -> None:
     """Warn of the first finding of each kind, a plural noun, with the number of the others."""
     for kind, texts in findings.items():

@@ -17,6 +17,7 @@ from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.options import choice, integer
 
 if TYPE_CHECKING:
+    import mitsuba as mi
     import numpy as np
 
 Vector = tuple[float, float, float]
@@ -75,6 +76,10 @@ class Material:
     specular: Color
     diffuse: Color
     texture: str | None = None
+    scale: tuple[float, float] = field(default=(1.0, 1.0), repr=False)  #: texture coordinates times it,
+    offset: tuple[float, float] = field(default=(0.0, 0.0), repr=False)  #: plus this
+    #: base and gain: base + gain · texel is the colour
+    texture_range: tuple[float, float] = field(default=(0.0, 1.0), repr=False)
 
 
 @dataclass(frozen=True)
@@ -296,6 +301,8 @@ def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> Node:
     if m.texture is not None:  # looked up as in the report, or as by Mitsuba: bilinear, sRGB-aware, repeated
         kind = "mrt_texture" if texturing == "report" else "bitmap"
         diffuse = {"type": kind, "filename": os.path.abspath(m.texture)}
+        if m.texture_range != (0.0, 1.0):
+            diffuse = {"type": kind, "bitmap": _ranged(m, texturing)}
     return {
         "type": "mrt_bsdf",
         "alpha": float(m.alpha),
@@ -304,3 +311,16 @@ def _mrt_bsdf(m: Material, fresnel: str, texturing: str) -> Node:
         "diffuse_reflectance": diffuse,
         "specular_reflectance": _rgb(m.specular),
     }
+
+
+def _ranged(m: Material, texturing: str) -> mi.Bitmap:
+    """Return the picture of a texture with its base and gain applied to the values that are looked up."""
+    import mitsuba as mi
+    import numpy as np
+
+    picture = mi.Bitmap(str(m.texture))
+    if texturing == "report":
+        picture.set_srgb_gamma(False)
+    texels = np.array(picture.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))
+    base, gain = m.texture_range
+    return mi.Bitmap(np.maximum(base + gain * texels, 0).astype(np.float32))

@@ -11,7 +11,7 @@ from typing import Any
 
 from mrt_mitsuba.errors import SceneError, warn
 from mrt_mitsuba.options import StrPath
-from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
+from mrt_mitsuba.scene.files import MISSING, decode, find, has_alpha, read_text, warn_of
 from mrt_mitsuba.scene.model import MAX_FLOAT, Material
 
 # Field of ``Material`` that a statement sets, by convention
@@ -32,7 +32,6 @@ _KNOWN = ("Kd", "Ks", "Ka", "Ni", "Ns", "map_Kd")
 # trailing zeros
 _WITHOUT_EFFECT = {"d 1", "Tr 0", "illum 0", "illum 1", "illum 2", "sharpness 60", "Ke 0 0 0", "Tf 1 1 1"}
 _WITHOUT_EFFECT |= {"-blendu on", "-blendv on", "-clamp off", "-cc off", "-boost 0", "-bm 1", "-type sphere"}
-_WITHOUT_EFFECT |= {"-s 1 1 1", "-o 0 0 0", "-mm 0 1"}
 
 
 def read_mtl(path: StrPath, *, convention: str = "report", folder: Path | None = None) -> dict[str, Material]:
@@ -46,10 +45,10 @@ def read_mtl(path: StrPath, *, convention: str = "report", folder: Path | None =
       which is nearest to a roughness of √(2 / (Ns + 2)) (Walter et al., "Microfacet Models for Refraction",
       2007, §5.2). Defaults of the format's description: Kd 0.8, Ks 0, Ni 1, Ns 0.
 
-    ``map_Kd`` names a picture that replaces Kd; it is looked for relative to ``folder`` (that of the OBJ
-    file), then to the MTL file. One that is missing is named in a warning and Kd is used. Values may exceed
-    1, as in the report. Statements and options that would change the picture and are not used are named in a
-    warning.
+    ``map_Kd`` names a picture that replaces Kd, with its options ``-s``, ``-o`` and ``-mm``; it is looked for
+    relative to ``folder`` (that of the OBJ file), then to the MTL file. One that is missing is named in a
+    warning and Kd is used. Values may exceed 1, as in the report. Statements and options that would change
+    the picture and are not used are named in a warning.
 
     Raises ``SceneError`` with file and line for what cannot be read.
     """
@@ -129,7 +128,7 @@ class _Reader:
             self.unused.setdefault(text.split()[0][:48], f"{where}: {text[:48].strip()}")
 
     def _texture(self, text: str, where: str) -> str | None:
-        """Return the path of a picture; None if it is missing."""
+        """Return the path of a picture, and store its options; None if it is missing."""
         for line in dict.fromkeys((text, _without_comment(text), text.partition("#")[0].strip())):
             words = line.split()
             # options of some words before the name, which may have blanks in it
@@ -137,13 +136,35 @@ class _Reader:
                 name = " ".join(words[first:]) if first else line
                 picture = find(name, self.folders)
                 if picture is not None:
-                    options = " ".join(words[:first])
-                    for option in re.findall(r"-[a-zA-Z]\w*(?: [^-]\S*| -[\d.]\S*)*", options):
-                        self._unused(option, where)
+                    self._options(words[:first], where)
+                    if has_alpha(picture):
+                        self._unused(f"alpha of {name}", where)
                     return str(picture)
         text = f"{where}: the texture {text} {MISSING} {self.folders[0]}; Kd is used in its place"
         self.missing.append(text)
         return None
+
+    def _options(self, words: list[str], where: str) -> None:
+        """Store the options of a texture, or record that they are unused."""
+        fields = {"-s": ("scale", 1.0), "-o": ("offset", 0.0), "-mm": ("texture_range", 1.0)}
+        for option in re.findall(r"-[a-zA-Z]\w*(?: [^-]\S*| -[\d.]\S*)*", " ".join(words)):
+            name, *values = option.split()
+            if name in fields:
+                target, second = fields[name]
+                self.blocks[self.name][target] = (*_floats(option, values, where), second)[:2]
+            else:
+                self._unused(option, where)
+
+
+def _floats(option: str, words: list[str], where: str) -> list[float]:
+    """Return the one to three numbers of an option."""
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if not 1 <= len(numbers) <= 3 or not all(abs(number) <= MAX_FLOAT for number in numbers):
+        raise SceneError(f"{where}: {option[:80]!r} must have one to three finite numbers")
+    return numbers
 
 
 def _numbers(statement: str, text: str, where: str) -> Any:

@@ -144,6 +144,8 @@ class _Reader:
             self.faces.append((faces, kinds, self.material, self.line))
             return
         values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)
+        if kind == "v" and values.shape[1] > 4 and "vertices" not in self.findings:
+            self.note("vertices", "colours of vertices are not used")
         values = values[:, : _USED[kind]]
         used = np.zeros((lines, _USED[kind]), np.float32)
         with np.errstate(over="ignore"):
@@ -180,15 +182,14 @@ class _Reader:
         """Read the libraries that a statement names; of materials of one name, the first counts."""
         folder = self.path.parent
         plain = text.partition("#")[0].strip()
-        names = [text, plain] if find(text, [folder]) or find(plain, [folder]) else plain.split()
-        found = [library for name in names if (library := find(name, [folder]))]
-        if not found:
-            self.note(
-                "libraries",
-                f"the material library {plain} {MISSING} {folder}; its materials get the default",
-            )
-        for library in found:
-            if str(library) not in self.libraries:
+        whole = [name for name in (text, plain) if find(name, [folder])][:1]
+        pieces = re.findall(r"\S.*?\.mtl(?=\s|$)", plain, re.IGNORECASE)  # each may have blanks in it
+        for name in whole or pieces or [plain]:
+            library = find(name, [folder])
+            if library is None:
+                text = f"the material library {name} {MISSING} {folder}; its materials get the default"
+                self.note("libraries", text)
+            elif str(library) not in self.libraries:
                 self.libraries.add(str(library))
                 self.materials = read_mtl(library, convention=self.convention, folder=folder) | self.materials
 
@@ -215,7 +216,7 @@ class _Reader:
                 self.fail(f"f has {problem}", line + row)
             used = self.materials.get(found.get(name) or "", DEFAULT_MATERIAL)
             if 1 not in kinds:  # no coordinates to look it up
-                used = replace(used, texture=None)
+                used = replace(used, texture=None, texture_range=(0.0, 1.0))
             corners = np.zeros((*faces.shape[:2], len(_USED)), np.int64)  # [F, corners, kinds]
             corners[:, :, kinds] = faces
             cut, crossing = triangulate(values[0][corners[:, :, 0]])
@@ -241,12 +242,13 @@ def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Materia
         new = np.cumsum(kept, dtype=np.uint32) - np.uint32(1)  # the vertices used, in their order
         return Mesh(points[kept], new[v], material)
     # Each corner becomes a vertex: a point may have another texture or normal in another triangle
+    scale, offset = np.array([material.scale, material.offset], np.float32)
     faces = np.arange(v.size, dtype=np.uint32).reshape(-1, 3)
     return Mesh(
         vertices=points[v.ravel()],
         faces=faces,
         material=material,
-        uvs=None if material.texture is None else uvs[vt.ravel()],
+        uvs=None if material.texture is None else uvs[vt.ravel()] * scale + offset,
         normals=normals[vn.ravel()] if smooth else None,
     )
 

@@ -151,41 +151,42 @@ def test_names_of_files(model, tmp_path, name):
 
 
 placed = Cases()
-placed("", "")
-placed("-s 1 1 1 -blendu on -clamp off", "")
-placed("-o .5 -.25 0 -mm 0.1 .5", "-o .5 -.25 0 is not used, nor -mm")
-placed("-s 2 3 1", "-s 2 3 1 is not used")
+placed("", [[0, 0], [1, 0], [1, 1]], "")
+placed("-s -2 3 1 -blendu on -clamp off", [[0, 0], [-2, 0], [-2, 3]], "")
+placed("-o .5 -.25 -mm 0.1 .5 -clamp on", [[0.5, -0.25], [1.5, -0.25], [1.5, 0.75]], "-clamp on")
+placed("-s 2 -o 1 -bm 0.3", [[1, 0], [3, 0], [3, 1]], "-bm 0.3")
 
 
-@pytest.mark.parametrize(("options", "unused"), placed)
-def test_options_of_a_texture(model, tmp_path, options, unused):
-    """Without effect, or named in a warning."""
+@pytest.mark.parametrize(("options", "uvs", "unused"), placed)
+def test_options_of_a_texture(model, tmp_path, options, uvs, unused):
+    """Obeyed, or named in a warning."""
     (tmp_path / "my picture.png").write_bytes(b"")
     mtl = PAINTED.replace("picture.png", f"{options} my picture.png # x")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         (mesh,) = model(USE_PAINTED, mtl)
-    assert [str(each.message).partition(": ")[2] for each in caught] == [unused] * bool(unused)
-    assert_allclose(mesh.uvs[mesh.faces[0]], [[0, 0], [1, 0], [1, 1]])
+    texts = [str(each.message).partition(": ")[2] for each in caught]
+    assert texts == [f"{unused} is not used"] * bool(unused)
+    assert_allclose(mesh.uvs[mesh.faces[0]], uvs)
 
 
 @pytest.mark.parametrize("texturing", ["report", "standard"])
 def test_a_textured_square(tmp_path, texturing):
     """Grey above black; values are as stored in the report's texturing, which turns pictures upside down,
-    and decoded from sRGB in the standard one. Also when exported.
+    and decoded from sRGB in the standard one. Base and gain are of the values looked up, also when exported.
     """
     halves = np.zeros((4, 4, 3), np.uint8)
     halves[:2] = 128
     Image.fromarray(halves).save(tmp_path / "halves.png")
     row, grey = {"report": (-1, 128 / 255), "standard": (0, 0.21586)}[texturing]
-    (tmp_path / "a.mtl").write_text("newmtl a\nKs 0 0 0\nmap_Kd halves.png\n")
+    (tmp_path / "a.mtl").write_text("newmtl a\nKs 0 0 0\nmap_Kd -mm 0.1 0.5 halves.png\n")
     (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{WHOLE}usemtl a\nf 1/1 2/2 3/3 4/4\n")
     view = {"camera": (0.5, 0.5, 2), "target": (0.5, 0.5, 0), "fov": 20, "light": (0.5, 0.5, 9)}
     options = {"width": 8, "height": 8, "aa": 1, "aamode": "none", "layers": ["albedo"]}
     written = write_xml(tmp_path / "a.obj", tmp_path / "b.xml", texturing=texturing, **view)
     for scene, more in ((tmp_path / "a.obj", {**view, "texturing": texturing}), (written[-1], {})):
         column = mrt.render(scene, **options, **more).layers["albedo.R"][:, 4]
-        assert_allclose(column[[row, -1 - row]], [grey, 0], rtol=1e-4)
+        assert_allclose(column[[row, -1 - row]], [0.1 + 0.5 * grey, 0.1], rtol=1e-4)
 
 
 named = Cases()
@@ -253,7 +254,8 @@ gaps(LOST, None, "report", ["model.obj:1: the material library nowhere.mtl is", 
 gaps(BLANKS, None, "report", ["model.obj:1: the material library no where.mtl is", "material 'red'"])
 for each in ("standard", "report"):
     gaps(USE_PAINTED, DROPPED, each, ["model.mtl:4: d 0.5 is not used, nor map_bump, Ke"])
-    gaps(EXTRA, None, each, ["5: the statement 't' is unknown", "; 1 more"])
+    colours = "1: colours of vertices are not used"
+    gaps(EXTRA, None, each, [colours, "5: the statement 't' is unknown", "; 1 more"])
 gaps(USE_PAINTED, "newmtl painted\nKd 0.5\nNs 9\nd 1\nKe 0 0 0", "report", [])
 
 
@@ -268,6 +270,15 @@ def test_what_is_missing_or_dropped_is_a_warning(model, obj, mtl, convention, te
     assert "more libraries" not in said
     assert mesh.material.texture is None
     assert (mesh.material.diffuse == (0.5,) * 3) is (mtl is not None)
+
+
+def test_alpha_of_a_texture_is_a_warning(model, tmp_path):
+    for alpha, kinds in ((255, 0), (9, 1)):
+        Image.new("RGBA", (2, 2), (1, 2, 3, alpha)).save(tmp_path / "picture.png")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model(USE_PAINTED, PAINTED)
+        assert [str(each.message).split()[1] for each in caught] == ["alpha"] * kinds
 
 
 # What files are made of, whole and in pieces
