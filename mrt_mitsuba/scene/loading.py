@@ -18,7 +18,6 @@ import difflib
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -82,6 +81,7 @@ def load_file(
     or a texture too large for the budget.
     """
     from mrt_mitsuba.scene.files import require_file
+    from mrt_mitsuba.scene.growth import Growth
 
     require_file(path)
     if not path.lower().endswith(".xml"):
@@ -91,23 +91,22 @@ def load_file(
     given = {name: str(value) for name, value in params.items() if name not in keys}
     offered = {name: str(value) for name, value in (options or {}).items() if value is not None} | given
     with _loading(path, os.path.dirname(path) or "."):
+        growth = Growth(dict(offered))
+        growth.read(path)
+        _check_parameters(path, given, growth.known)
         config = mi.parser.ParserConfig(mi.variant())
         config.unused_parameters = mi.LogLevel.Debug  # a file has few of the options
         state = mi.parser.parse_file(config, path, **offered)
         budget.inputs.update(map(str, state.files))
-        text = "".join(Path(str(file)).read_text(errors="replace") for file in state.files)
-        defaults = dict(re.findall(r'<default\s+name="(\w+)"\s+value="([^"]*)"', text))
-        _check_parameters(path, given, {*defaults, *re.findall(r"\$(\w+)", text)})
         _check_nodes(state.nodes, budget)
-        values = defaults | offered
         if not as_text:
-            return _instantiate(state, True, keys), values
+            return _instantiate(state, True, keys), growth.values
         for node in state.nodes:
             if isinstance(node.props.get("filename", None), str):
                 node.props["filename"] = os.path.abspath(_resolved(node.props["filename"]))
         if strange := _set_properties(state, keys):
             raise UsageError(f"{path} does not state {min(strange)}: write it into the file")
-        return mi.parser.write_string(state), values
+        return mi.parser.write_string(state), growth.values
 
 
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------

@@ -136,6 +136,7 @@ def unending(inside: str) -> None:
     refused("out scene=a.xml", "not a regular file", xml(inside.format("pipe")) | PIPES)
 
 
+unending("<include filename='p&#105;pe'/>")
 unending(f"<emitter type='envmap'>{NAMED}</emitter>")
 unending(f"<shape type='ply'>{NAMED}</shape>")
 for kind in ("mrt_texture", "bitmap"):

@@ -10,7 +10,7 @@ from nodes import sensor
 from numpy.testing import assert_allclose, assert_array_equal
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.errors import MrtError, MrtWarning
+from mrt_mitsuba.errors import MrtError, MrtWarning, SceneError
 from mrt_mitsuba.scene.export import write_xml
 from mrt_mitsuba.scene.model import Camera, Material, Scene, Sphere
 from mrt_mitsuba.scene.open import open_scene
@@ -117,9 +117,21 @@ wrong(ALL | {"zzz": 3}, r"has no parameter \$zzz: it has glow, integrator, spp, 
 wrong({"where": "in"}, r"undefined parameter: \$integrator")
 wrong(ALL | {"ball.centre": [0, 0, 5]}, r"no parameter ball.centre: did you mean ball.center\?")
 wrong(ALL | {"ball.center": [0, 5]}, "must be a Point3f")
+wrong(ALL | {"glow": "1" * (2**24 + 1)}, "its parameters come to more than 16777216 characters")
 
 
 @pytest.mark.parametrize(("params", "message"), wrong)
 def test_parameters_that_are_refused(nested, params, message):
     with pytest.raises(MrtError, match=message):
         mrt.render(nested, params=params)
+
+
+DOUBLE = "".join(f'<default name="a{i:02}" value="{f"$a{i - 1:02}" * 9 if i else "x"}"/>' for i in range(12))
+
+
+@pytest.mark.parametrize("text", [DOUBLE, '<include filename="in/inner.xml"/>' * 501])
+def test_files_that_multiply_are_refused(nested, text):
+    """Gigabytes from some hundred bytes: of parameters that name each other, of files included many times."""
+    nested.write_text(f'<scene version="3.0.0">{text}</scene>')
+    with pytest.raises(SceneError, match=r"come to more than|includes more than 1000 files"):
+        mrt.render(nested)
