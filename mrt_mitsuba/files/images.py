@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 # For zlib to look for runs only: as fast as its level 1, and 161 kB for scene 3 in place of 206
 PNG_RUNS = 3
 
+MAX_EXR_NAME = 255  # bytes of the name of a channel or an attribute; the library cuts longer ones
+
 COMPRESSION = choice("zip", "none")
 TONEMAP = choice("report", "srgb")
 _PIXELS = 2**14  # converted to 8 bit at a time, so that intermediate arrays stay in the processor's cache
@@ -56,8 +58,8 @@ def save(
     B or Y. Header values are text or numbers; anything else is written as JSON. ``inputs``: files that the
     picture is made from.
 
-    Raises ``OutputError`` for a file that cannot be written, or that is one of ``inputs``, and for pixels or
-    values that a picture cannot hold; ``UsageError`` without a name of a file.
+    Raises ``OutputError`` for a file that cannot be written, or that is one of ``inputs``, and for pixels,
+    names or values that a picture cannot hold; ``UsageError`` without a name of a file.
     """
     check("tonemap", TONEMAP, tonemap)
     check("compression", COMPRESSION, compression)
@@ -118,6 +120,8 @@ def _write_exr(
     import OpenEXR
 
     planes = _planes(image, layers)
+    for name in (*planes, *header):
+        _check_name(name)
     attributes = {name: _attribute(name, value) for name, value in header.items()}
     raised: list[BaseException] = []
 
@@ -161,6 +165,7 @@ def _planes(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
 
     planes = {"RGB": np.ascontiguousarray(_picture(image))}
     for name, values in layers.items():
+        _check_name(name)
         array = np.atleast_3d(_floats(values, f"layer {name}"))
         letters = "RGB" if array.shape[2] == 3 else "Y"
         if name in LAYERS:
@@ -174,19 +179,38 @@ def _planes(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
     return planes
 
 
+def _check_name(name: Any) -> None:
+    """Raise ``OutputError`` for a name of a channel or an attribute that an EXR would cut or refuse."""
+    try:
+        size = 0 if "\0" in name else len(name.encode())
+    except (TypeError, AttributeError, ValueError):  # no text, or a lone surrogate
+        size = 0
+    if not 0 < size <= MAX_EXR_NAME:
+        shown = f"{name!r:.60}"
+        raise OutputError(f"{shown} is no name that an EXR can hold: text of 1 to {MAX_EXR_NAME} bytes")
+
+
 def _attribute(name: str, value: Any) -> str | int | float:
     """Return a header value as an EXR holds it: text and numbers as they are, anything else as JSON."""
     import numpy as np
+
+    def plain(part: Any) -> Any:
+        """Return a part that JSON does not know as numbers, or as text where it has a text of its own."""
+        numbers = np.asarray(part)
+        if numbers.dtype.kind in "biuf":
+            return numbers.tolist()
+        text = str(part)
+        if isinstance(part, bytes) or " at 0x" in text:  # an address, another one each time
+            raise TypeError(f"{type(part).__name__} {text:.60}")
+        return text
 
     value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, float) or (isinstance(value, int) and -(2**31) <= value < 2**31):
         return value
     try:
-        text = value
-        if not isinstance(value, str):
-            text = json.dumps(value, default=lambda part: np.asarray(part).tolist())
+        text = value if isinstance(value, str) else json.dumps(value, default=plain)
     except (TypeError, ValueError) as error:
-        raise OutputError(f"header {name}: neither text nor numbers nor JSON: {error}") from error
+        raise OutputError(f"header {name}: neither text nor numbers nor JSON can hold {error}") from error
     return text.encode(errors="backslashreplace").decode()
 
 

@@ -92,7 +92,7 @@ def test_exr_holds_every_bit(tmp_path, image):
 
 @pytest.mark.parametrize(
     "layer",
-    [("depth", (7, 6)), ("normal", (7, 5, 2)), ("x", (7,))],
+    [("depth", (7, 6)), ("normal", (7, 5, 2)), ("x", (7,)), ("x" * 254, (7, 5))],
     ids=lambda layer: f"{layer!r:.20}",
 )
 def test_layer_of_another_shape(tmp_path, image, layer):
@@ -216,6 +216,10 @@ attributes("k", np.float32(0.5), 0.5)
 attributes("k", 2**31, "2147483648")
 attributes("k", {"a": np.arange(2), "b": np.float32(2)}, '{"a": [0, 1], "b": 2.0}')
 attributes("k", "\ud800", "\\ud800")
+attributes("k" * 256, "x", OutputError)
+attributes("k\0", "x", OutputError)
+attributes("\ud800", "x", OutputError)
+attributes("k", b"x", OutputError)
 attributes("k", [object()], OutputError)
 attributes("k", {(1, 2): 3}, OutputError)
 
