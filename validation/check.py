@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.files.replacing import replacing
 from mrt_mitsuba.machine import Budget
+from mrt_mitsuba.options import StrPath
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation import laws
 from mrt_mitsuba.validation.laws.case import PREAMBLES
 from mrt_mitsuba.validation.laws.examine import TIMEOUT
-from mrt_mitsuba.validation.laws.page import Check
-from mrt_mitsuba.validation.laws.scene import SceneCheck
+from mrt_mitsuba.validation.page import prepare_folder
 
 PREAMBLES["mrt_mitsuba"] = ("import mrt_mitsuba as mrt  # before mitsuba", "mrt.register()")
 
@@ -29,6 +31,28 @@ def _with_our_errors() -> Iterator[None]:
         raise UsageError(str(error)) from error
     except laws.LoadError as error:
         raise SceneError(str(error)) from error
+
+
+class _Saved(laws.Findings):
+    """A result whose page this package writes."""
+
+    def save(self, folder: StrPath) -> None:
+        """Write a page (``index.html``), ``summary.json`` and ``laws.csv``, all or none. Raises
+        ``OutputError``.
+        """
+        files = self.files()
+        prepare_folder(Path(folder), *files)
+        with replacing(*(Path(folder) / name for name in files)) as opened:
+            for file, content in zip(opened, files.values(), strict=True):
+                file.write(content)
+
+
+class Check(_Saved, laws.Check):
+    """The findings of a check of one plugin."""
+
+
+class SceneCheck(_Saved, laws.SceneCheck):
+    """The findings of a check of a scene."""
 
 
 def check_bsdf(
@@ -47,7 +71,7 @@ def check_bsdf(
     """
     runtime.use()
     with _with_our_errors():
-        return laws.check_bsdf(bsdf, quick=quick, seed=seed, only=only, timeout=timeout)
+        return Check(**vars(laws.check_bsdf(bsdf, quick=quick, seed=seed, only=only, timeout=timeout)))
 
 
 def check_shape(
@@ -64,7 +88,7 @@ def check_shape(
     """
     runtime.use()
     with _with_our_errors():
-        return laws.check_shape(shape, quick=quick, seed=seed, only=only, timeout=timeout)
+        return Check(**vars(laws.check_shape(shape, quick=quick, seed=seed, only=only, timeout=timeout)))
 
 
 def check_emitter(
@@ -83,7 +107,8 @@ def check_emitter(
     """
     runtime.use()
     with _with_our_errors():
-        return laws.check_emitter(emitter, scene=scene, quick=quick, seed=seed, only=only, timeout=timeout)
+        found = laws.check_emitter(emitter, scene=scene, quick=quick, seed=seed, only=only, timeout=timeout)
+    return Check(**vars(found))
 
 
 def check_scene(
@@ -111,7 +136,7 @@ def check_scene(
                 advance(1)
 
     with sized(source):
-        return laws.check_scene(
+        found = laws.check_scene(
             source.scene,
             integrator=source.integrator,
             sensor=source.sensor,
@@ -120,3 +145,4 @@ def check_scene(
             seed=seed,
             progress=each,
         )
+    return SceneCheck(**vars(found))

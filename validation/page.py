@@ -45,9 +45,9 @@ def prepare_folder(folder: Path, *names: str, inputs: Sequence[str] = ()) -> Non
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        problem = f"cannot make the folder {folder}: {error.strerror}; choose another --out"
-        raise OutputError(problem) from error
+    except (OSError, ValueError) as error:  # also of a zero byte, or a lone surrogate
+        why = getattr(error, "strerror", None) or error
+        raise OutputError(f"cannot make the folder {folder}: {why}; choose another") from error
     for name in names or ("summary.json", "index.html"):
         check_target(folder / name, inputs)
 

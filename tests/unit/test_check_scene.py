@@ -15,6 +15,7 @@ from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
+from mrt_mitsuba.errors import OutputError
 from mrt_mitsuba.validation.laws import emitter as emitters
 from mrt_mitsuba.validation.laws import scene as checks
 from mrt_mitsuba.validation.laws.faults import put
@@ -326,3 +327,14 @@ def test_each_figure_of_an_emitter_has_a_specimen():
 def test_a_scene_without_shapes_is_checked():
     nodes = {"type": "scene", "sensor": {"type": "perspective"}, "sky": {"type": "constant"}}
     assert mrt.check_scene(nodes | {"integrator": {"type": "path"}}, quick=True).passed
+
+
+@pytest.mark.parametrize("folder", ["", "laws.csv/x", "a\0"])
+def test_a_page_that_cannot_be_written(tmp_path, folder):
+    """Whole or not at all, and by one error."""
+    (tmp_path / "laws.csv").mkdir()
+    found = mrt.check_bsdf({"type": "diffuse"}, quick=True, only=["energy"])
+    (tmp_path / "laws.csv" / "x").touch()
+    with pytest.raises(OutputError, match=r"cannot (make|write)"):
+        found.save(tmp_path / folder)
+    assert [path.name for path in tmp_path.iterdir()] == ["laws.csv"]

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .law import LoadError as LoadError
     from .law import UsageError as UsageError
     from .page import Check as Check
+    from .page import Findings as Findings
     from .scene import SceneCheck as SceneCheck
     from .scene import check_scene as check_scene
     from .shape import check_shape as check_shape
@@ -25,6 +26,7 @@ HOMES = {
     "LoadError": "law",
     "UsageError": "law",
     "Check": "page",
+    "Findings": "page",
     "SceneCheck": "scene",
     "check_scene": "scene",
     "check_shape": "shape",
