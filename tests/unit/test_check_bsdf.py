@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import gc
+import io
 import json
+import re
 import time
 import weakref
 
@@ -13,6 +16,7 @@ import numpy as np
 import pytest
 from cases import Cases, but_slow
 from nodes import rgb
+from PIL import Image
 from scipy import stats
 from unit import specimens
 from unit.specimens import exceeded
@@ -87,6 +91,21 @@ def test_faults_three_times_as_large_as_documented_are_found(kind, fault, varian
     size = 3 * (fault.quick if quick else fault.full)
     check = power.KINDS[kind].check_fault(fault, size, quick=quick)
     assert f"{fault.law}.{fault.criterion}" in exceeded(check), str(check)
+
+
+PLOTTED = [("BSDF", "sampling"), ("BSDF", "energy"), ("BSDF", "reciprocity"), ("shape", "normals")]
+
+
+@pytest.mark.parametrize(("kind", "law"), PLOTTED)
+def test_pages_show_plots(kind, law, variant, tmp_path):
+    fault = next(fault for fault in power.KINDS[kind].faults if fault.law == law)
+    check = power.KINDS[kind].check_fault(fault, 3 * fault.quick, quick=True)
+    check.save(tmp_path)
+    page = (tmp_path / "index.html").read_text()
+    plots = re.findall(r'alt="Plot of (\w+)" src="data:image/png;base64,([^"]+)"', page)
+    assert [name for name, _ in plots] == [law]
+    image = np.array(Image.open(io.BytesIO(base64.b64decode(plots[0][1]))))
+    assert image.std() > 5  # something is drawn
 
 
 def test_each_figure_has_a_specimen():

@@ -1,7 +1,7 @@
 """Laws of BSDFs, shapes and emitters: checks of anyone's plugins by what must hold, without a reference.
 
-Needs Mitsuba, Dr.Jit, NumPy, SciPy and Jinja. A module is imported with the first of its names that is used,
-so that ``probe`` alone needs no SciPy.
+Needs Mitsuba, Dr.Jit, NumPy, SciPy and Jinja; matplotlib for plots. A module is imported with the first of
+its names that is used, so that ``probe`` alone needs no SciPy.
 """
 
 from __future__ import annotations

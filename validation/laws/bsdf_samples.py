@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-from . import probe
+from . import plots, probe
 from .bsdf_case import G1_FIT_ERROR, POINTWISE_TOL, BsdfCase, View, live, narrow
 from .bsdf_snippets import CELL, SAMPLE, VALUE, WHOLE
 from .faults import (
@@ -157,6 +159,10 @@ def sampling(law: Outcome, case: BsdfCase) -> None:
     broad = [view for view in case.views if 0 < view.density.max() < MAX_BROAD_DENSITY]
     if broad and not case.quick and not is_scalar():
         _in_small_cells(law, case, broad)
+    if not law.holds:
+        view, cells = judged[i]
+        angle = float(np.degrees(np.arccos(view.at.wi[2])))
+        law.plot = partial(plots.density, cells, cells.counts(view.codes) / view.count, angle)
     if len(judged) < len(case.views):
         law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(judged)} angles, which are left out")
 
@@ -287,9 +293,13 @@ def energy(law: Outcome, case: BsdfCase) -> None:
         # where values are NaN, the law ``finite`` says so
         apart.append(_apart(case, view, cells, s) if cells and view.holes < 0.01 else 0.0)
     surely = [(mean - SIGMAS * error).max() for mean, error in means]
-    law.check("largest", surely, joined([grazing, case.incidence]))
+    at = joined([grazing, case.incidence])
+    law.check("largest", surely, at)
     if any(case.cells):
         law.check("apart", apart, case.incidence)
+    if not law.holds:
+        albedos, errors = np.max(means, axis=2).T
+        law.plot = partial(plots.albedo, np.degrees(np.arccos(at.wi[:, 2])), albedos, errors)
 
 
 def _mean(weight: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import noise, probe
+from . import noise, plots, probe
 from .bsdf_case import POINTWISE_TOL, BsdfCase, changed, parameters
 from .bsdf_snippets import SAMPLE, VALUE
 from .case import READS, READS_WHY, judge_many, reads_checked
@@ -171,6 +171,8 @@ def reciprocity(law: Outcome, case: BsdfCase) -> None:
     for name, other, expected in (("swapped", back, swapped), ("modes", importance, importance(pairs))):
         error = excess(value, expected, allowed + case.spread(other, pairs))
         law.check(name, error, pairs)
+    if not law.holds:
+        law.plot = partial(plots.swapped, value[:3000].max(axis=1), swapped[:3000].max(axis=1))
     _delta_either_way(law, case)
     # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
     s = case.drawn

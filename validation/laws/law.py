@@ -185,6 +185,7 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
     program: Callable[..., str] | None = None  # writes snippets, while the law is checked
     output: str = ""  # what the snippet of the worst criterion prints, where the law fails
+    plot: Callable[..., None] | None = None  # draws the failure into a figure of matplotlib
 
     def check(
         self,

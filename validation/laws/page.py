@@ -1,4 +1,4 @@
-"""The findings of a check and their page: what failed comes first, with a program and its output."""
+"""The findings of a check and their page: what failed comes first, with a program, its output and a plot."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import jinja2
 import mitsuba as mi
 import numpy as np
 
+from . import plots
 from .law import Measurement, Outcome
 
 COLUMNS = ("subject", "law", "verdict", "criterion", "measured", "sense", "limit", "note")
@@ -102,7 +103,7 @@ def files_of(
     page = pages.from_string((Path(__file__).parent / "page.html").read_text("utf-8"))
     failed_first = sorted(checks.items(), key=lambda item: not item[1].failed)
     return {
-        "index.html": page.render(summary, checks=failed_first).encode(),
+        "index.html": page.render(summary, checks=failed_first, plot=plots.as_png).encode(),
         "summary.json": text.encode() + b"\n",
         "laws.csv": rows.getvalue().encode(),
     }

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.linalg import norm
 from scipy import stats
 
-from . import noise
+from . import noise, plots
 from .case import READS, READS_WHY, class_name, judge_many, reads_checked
 from .faults import SIZE, larger, member, off_surface, put, tilted
 from .law import (
@@ -230,6 +230,7 @@ def _from_near_by(law: Outcome, case: ShapeCase) -> None:
     law.check("behind", apart / (ROUNDING * largest), again, where=alike)
 
 
+PIXELS = 128  # of a side of a picture of normals
 NEIGHBOUR = """aside = mi.Vector3f({aside})
 si = scene.ray_intersect(mi.Ray3f(o, d))
 near = scene.ray_intersect(mi.Ray3f(o + 1e-3 * {size} * aside, d))
@@ -263,7 +264,9 @@ def inwards(size, si, ray):
         RAY,
     ),
     length=most("length of a normal less 1", 1e-5, "a square root and a quotient", RAY),
-    side=number_of("shading normals on the other side than the geometric one", 0, "one surface", RAY),
+    side=number_of(
+        "shading normals on the other side than the geometric one", 0, "both belong to one surface", RAY
+    ),
     shading=Criterion(
         0.9,
         "shading normal against the geometric one, except on smoothed meshes, 90th percentile",
@@ -319,6 +322,19 @@ def normals(law: Outcome, case: ShapeCase) -> None:
     if np.isfinite(slant).any():
         law.check("slant", slant, met, where=np.isfinite(slant))
     _differences(law, case)
+    if not law.holds:
+        hits = _picture(case)
+        law.plot = partial(plots.normals, hits.n, hits.shading, hits.met)
+
+
+def _picture(case: ShapeCase) -> Lanes:
+    """The hits of parallel rays from a corner, those of a square picture."""
+    back = np.array([[0.48, 0.36, 0.8]])
+    right = unit(np.cross([[0, 1, 0]], back))
+    x, y = np.meshgrid(np.linspace(-0.55, 0.55, PIXELS), np.linspace(0.55, -0.55, PIXELS))
+    offsets = x.reshape(-1, 1) * right + y.reshape(-1, 1) * np.cross(back, right)
+    o = case.middle + case.size * (offsets + 1.5 * back)
+    return trace(case.target, o, np.tile(-back, (len(o), 1)))
 
 
 def _differences(law: Outcome, case: ShapeCase) -> None:

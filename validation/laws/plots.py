@@ -1,0 +1,97 @@
+"""Plots of laws that fail, by matplotlib, which is imported when a page is saved."""
+
+from __future__ import annotations
+
+import base64
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .probe import Array
+from .sphere import Cells
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from .law import Outcome
+
+
+def as_png(law: Outcome) -> str:
+    """The plot of a law as Base64 text; "" if it has none, or matplotlib is not installed."""
+    if law.plot is None:
+        return ""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        return ""
+    figure = Figure((7, 4), layout="constrained")
+    law.plot(figure)
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=110)
+    return base64.b64encode(png.getvalue()).decode()
+
+
+def density(cells: Cells, seen: Array, angle: float, figure: Figure) -> None:
+    """Shares of samples in cells [C] against integrals of pdf(), per steradian, over both hemispheres.
+
+    ``angle`` of incidence in degrees. Cells are summed up to those of the coarsest level.
+    """
+    side = 2 ** int(cells.level.min())
+    r, turn = cells.corner
+    place = np.stack([cells.below, r * side, turn * side]).astype(int)  # [3, C]
+    shares = np.zeros((2, 2, side, side))
+    np.add.at(shares[0], tuple(place), seen)
+    np.add.at(shares[1], tuple(place), cells.mean[:, 0])
+    edges = np.linspace(0, 1, side + 1)
+    shares /= 2 * np.pi / side * np.diff(edges**2)[:, None]
+    top = shares.max()
+    azimuth = 2 * np.pi * edges - np.pi
+    axes = figure.subplots(2, 3, subplot_kw={"projection": "polar"})
+    apart = shares[0] - shares[1]
+    most = max(abs(apart).max(), 1e-12)
+    for row, half in enumerate(("above", "below")):
+        for column, name in enumerate(("samples", "pdf()")):
+            drawn = axes[row, column].pcolormesh(azimuth, edges, shares[column, row], vmin=0, vmax=top)
+            axes[row, column].set_title(f"{name}, wo {half}")
+        off = axes[row, 2].pcolormesh(azimuth, edges, apart[row], cmap="RdBu_r", vmin=-most, vmax=most)
+        axes[row, 2].set_title("samples − pdf()")
+    for each in axes.flat:
+        each.set_axis_off()
+    figure.colorbar(drawn, ax=axes[:, :2], label="density per steradian")
+    figure.colorbar(off, ax=axes[:, 2])
+    figure.suptitle(f"wi at {angle:.0f}° to the normal")
+
+
+def swapped(forth: Array, back: Array, figure: Figure) -> None:
+    """f(ωi, ωo) against f(ωo, ωi), both [N]."""
+    axes = figure.subplots()
+    lit = (forth > 0) & (back > 0)
+    axes.loglog(back[lit], forth[lit], ".", markersize=2)
+    ends = np.sort(back[lit])
+    axes.plot(ends, ends, color="black", linewidth=0.8, label="reciprocal")
+    axes.tick_params(axis="x", which="both", labelrotation=30)
+    axes.set(xlabel="f(ωo, ωi) η_i²", ylabel="f(ωi, ωo) η_o²")
+    axes.legend()
+
+
+def albedo(angles: Array, samples: Array, errors: Array, figure: Figure) -> None:
+    """Mean weights of samples, with six standard errors, against the angle of incidence. [N] each"""
+    axes = figure.subplots()
+    order = np.argsort(angles)
+    axes.errorbar(angles[order], samples[order], 6 * errors[order], fmt="o-", label="mean weight of samples")
+    axes.axhline(1, color="black", linewidth=0.8, label="all light reflected")
+    axes.set(xlabel="angle of incidence (degrees; above 90 from behind)", ylabel="albedo, brightest channel")
+    axes.set_ylim(bottom=0)
+    axes.legend()
+
+
+def normals(geometric: Array, shading: Array, seen: Array, figure: Figure) -> None:
+    """Normals in a square picture [N, 3] as colours (n + 1) / 2, where a surface is seen [N]."""
+    side = int(len(seen) ** 0.5)
+    both = {"geometric normal": geometric, "shading normal": shading}
+    for axes, (name, values) in zip(figure.subplots(1, 2), both.items(), strict=True):
+        colors = np.where(seen[:, None], np.clip(0.5 * values + 0.5, 0, 1), 1)
+        axes.imshow(np.nan_to_num(colors).reshape(side, side, 3))
+        axes.set_title(f"{name}: (n + 1) / 2 as RGB")
+        axes.set_axis_off()
