@@ -73,10 +73,14 @@ def side_by_side(folder: str | os.PathLike[str]) -> tuple[Figure, list[dict[str,
         result = mrt.render(original.scene, fresnel="dielectric", progress=Progress(), **original.options)
         ours = original.like(result.image)
         difference = np.abs(ours - original.image)
-        shown = {"original": original.image, "ours": ours, "|difference| × 100": 100 * difference}
+        shown = {
+            f"scene {scene}, 2020": original.image,
+            "this project": ours,
+            "difference × 100": 100 * difference,
+        }
         for axes, (title, picture) in zip(row, shown.items(), strict=True):
             plotting.show_picture(axes, picture)
-            axes.set_title(f"scene {scene}: {title}", loc="left")
+            axes.set_title(title, loc="left")
         off = f"{(difference.max(axis=-1) > 1 / 255).mean():.2%}"
         mean = float(difference.mean())
         rows.append({"scene": scene, "mean difference": mean, "pixels off by > 1/255": off})

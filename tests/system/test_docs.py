@@ -46,6 +46,7 @@ QUICKER = {
     '"resx": 320, "resy": 180': '"resx": 80, "resy": 45',
     '"sample_visible": False})': '"sample_visible": False}, quick=True)',
     "height=48)": "height=48, workers=1)",
+    "height=120)": "height=120, workers=1)",
 }
 SMALLER = """
 def smaller(box):
