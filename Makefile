@@ -5,7 +5,7 @@
 # make docs                            the documentation as a site: docs/_build/index.html
 # make pictures [ARGS="check"]          the pictures of README anew, in docs/pictures
 # make browser                         site, reports and pages of checks as an installed Chromium shows them
-# make bench  [ARGS="--before PYTHON"]  time renders, in turns with an earlier version
+# make bench  [ARGS="--before PYTHON"]  time renders, interleaved with an earlier version
 # make device-check                    pictures and tests on an NVIDIA GPU, in five minutes at most
 # make bench-gpu                       times on an NVIDIA GPU
 # make setup                            the environment alone: .venv with the commands mrt and mrt-validate

@@ -81,7 +81,7 @@ class Workspace:
         return cls(budget.size - finished)
 
     def wavefront_size(self, channels: int) -> int:
-        """Return the number of rays of a wavefront that returns so many channels."""
+        """Return the number of rays of a wavefront that returns ``channels`` values each."""
         return max(1, min(self.size // (channels * BYTES_PER_CHANNEL_OF_RAY), MAX_WAVEFRONT))
 
     def band_rows(self, width: int) -> int:

@@ -37,7 +37,7 @@ class Allocator:
         return np.concatenate([widened(self.film, allocation[HALVES]), allocation[PILOTS]])
 
     def required_spp(self, stats: SampleStatistics, forecast: Forecast, rmse: float) -> float:
-        """Mean rays of a pixel, in all, that reach an RMSE, as the pilots foresee it."""
+        """Total mean spp that reaches an RMSE, as predicted by the pilots."""
         deviation = np.sqrt(forecast.variance, dtype=np.float64)
         half = np.maximum(deviation * (deviation.mean() / (2 * rmse**2)), stats.count[0])
         return float(2 * (half - stats.count[0]).mean() + stats.count.sum(0).mean())

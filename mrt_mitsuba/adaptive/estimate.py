@@ -302,7 +302,7 @@ def pixel_error(stats: SampleStatistics, variance: np.ndarray, blurred: Blurred 
 
 
 def forecast(stats: SampleStatistics) -> Forecast:
-    """Return the error of the picture as the pilot buffers foresee it."""
+    """Return the error of the picture as predicted from the pilot buffers."""
     variance = ray_variance(stats, stats.sums(2), stats.sums(3)) * np.float32(stats.unit)
     left = stats.without_border(variance / stats.count[HALVES].sum(0))
     squares, _ = differences(stats.sums(2), stats.sums(3))

@@ -23,7 +23,7 @@ MIN_SPP = 8  # rays of a pixel in the first round
 
 @AdaptiveIntegrator.register
 class MrtAdaptive(mi.SamplingIntegrator):
-    r"""Renders to an error with another integrator: rays go in rounds to the pixels that need them.
+    r"""Adaptive sampling of a nested integrator, in rounds, until an error target is met.
 
     It does what ``mrt.render`` does with ``target``, where there is only ``mi.render`` or an XML file. The
     scene's film is filled by its own rules, and holds the channels of the nested integrator, then

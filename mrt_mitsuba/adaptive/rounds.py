@@ -195,7 +195,7 @@ def plan_round(
     if caution * now.rmse <= target:
         return None
     wanted = TARGET_MARGIN * target / (caution * now.rmse)
-    # of the ray count, in all pixels alike and in shares, which follow the pilots' noise and promise too much
+    # growth of the ray count if spread evenly, and if allocated by the pilots' noise, which promises too much
     alike = wanted**-2
     in_shares = allocator.required_spp(stats, seen, max(wanted * seen.rmse, 1e-100)) / now.spp
     growth = math.sqrt(alike * in_shares) ** (1 / (1 + allocator.gain))
@@ -248,7 +248,7 @@ def _tail_warning(error: ErrorEstimate) -> str:
     return (
         f"a few rays dominate the error estimate of {error.rmse:.3g}, and the error may be larger by any "
         f"amount: the tail of what rays contribute has a Pareto shape of {error.tail:.2g}, above "
-        f"{PARETO_K_THRESHOLD}. Another integrator, larger lamps or rougher materials where such rays come "
+        f"{PARETO_K_THRESHOLD}. Another integrator, larger lights or rougher materials where such rays come "
         "from, or more rays help"
     )
 
@@ -257,7 +257,7 @@ def _target_warning(goal: Goal, now: Round, target: float | None) -> str:
     """Return a warning if the target was not reached, else ""."""
     if target == 0:
         return (
-            f"target={goal.target}: the picture is black, as far as pilot rays have met it, and so a share "
+            f"target={goal.target}: the picture is black in the pilot samples, so that a percentage "
             "of its mean luminance is 0; the render ends. Give a number, such as target=0.01"
         )
     if goal.target is None or target is None or now.rmse <= target:

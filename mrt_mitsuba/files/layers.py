@@ -43,15 +43,19 @@ _DERIVED = (
 )
 _AVERAGED = (
     Layer("image", "RGB", AVERAGED, "the picture", lambda r: r.image, internal=True),
-    Layer("direct", "RGB", AVERAGED, "light without mirror rays", lambda r: r.rgb(r.trace.direct)),
+    Layer(
+        "direct", "RGB", AVERAGED, "radiance without specular reflections", lambda r: r.rgb(r.trace.direct)
+    ),
     Layer(
         "reflection",
         "RGB",
         AVERAGED,
-        "light that mirror rays add",
+        "radiance that specular reflections add",
         lambda r: r.rgb(r.trace.radiance - r.trace.direct),
     ),
-    Layer("bounces", "Y", AVERAGED, "number of mirror rays", lambda r: r.trace.bounces, counts="mirror"),
+    Layer(
+        "bounces", "Y", AVERAGED, "number of specular reflections", lambda r: r.trace.bounces, counts="mirror"
+    ),
     Layer("shadow_rays", "Y", AVERAGED, "", lambda r: r.trace.shadow_rays, counts="shadow", internal=True),
     Layer("square", "RGB", AVERAGED, "square of the picture", lambda r: r.image * r.image, internal=True),
 )

@@ -1,7 +1,7 @@
-"""Replacing files: all those of one result or none, and never one that the result was made from.
+"""Atomic replacement of files: all of one result or none, and never an input of the result.
 
 New files are written next to the old ones under temporary names. Once all are complete and on the disk, they
-take the places of the old; if anything goes wrong before, they disappear.
+replace the old; after any earlier error, they are deleted.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ def _target(path: StrPath, inputs: Iterable[StrPath]) -> str:
     target = os.path.realpath(name)
     folder = os.path.dirname(target)
     if not os.path.isdir(folder):
-        problem = "is a file, not a folder; choose another place"
+        problem = "is a file, not a folder; choose another folder"
         problem = problem if os.path.exists(folder) else "does not exist; create it first"
-        raise OutputError(f"cannot write {name}: the place {folder} {problem}")
+        raise OutputError(f"cannot write {name}: {folder} {problem}")
     try:
         old = os.lstat(target)
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The pixels of one picture as flat Dr.Jit arrays, in whichever backend is at hand."""
+"""The pixels of one picture as flat Dr.Jit arrays, in the backend of the current variant."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def finite(planes: Sequence[Float]) -> Mask:
 def window_means(values: np.ndarray, reach: int) -> np.ndarray:
     """Means over windows of ``reach`` pixels, a power of two, to each side.
 
-    Sums of 1, 2, 4, ... neighbours are each formed of the last ones, without differences that would cancel.
+    Sums of 1, 2, 4, ... neighbours are each formed from the previous ones: no differences cancel.
     """
     rows, columns = values.shape[-2:]
     wide = np.zeros((*values.shape[:-2], rows + 2 * reach, columns + 2 * reach), values.dtype)
@@ -146,13 +146,13 @@ def window_counts(shape: tuple[int, ...], reach: int) -> np.ndarray:
 
 
 def _window_sizes(count: int, reach: int) -> np.ndarray:
-    """The number of a line's pixels within reach of each, itself among them."""
+    """Number of pixels of a line within ``reach`` of each, itself included."""
     before = np.minimum(np.arange(count), reach)
     return before + before[::-1] + 1
 
 
 def dilated(mask: np.ndarray, reach: int) -> np.ndarray:
-    """A mask grown by so many pixels along both axes."""
+    """A mask dilated by ``reach`` pixels along both axes."""
     for count in mask.shape[:-3:-1]:  # along rows, then, turned, along columns
         wide = np.pad(mask, [(0, 0)] * (mask.ndim - 1) + [(reach, reach)])
         near = (wide[..., step : step + count] for step in range(2 * reach + 1))

@@ -13,7 +13,7 @@ import numpy as np
 from mrt_mitsuba.rendering.film import Film, divide, opaque
 
 PIXELS_AT_ONCE = 2**15  # whose sums are formed at once; those of more would not stay in a cache
-OFFSETS_AT_ONCE = 5  # along an axis: a kernel adds rays up for so many pixels next to each other
+OFFSETS_AT_ONCE = 5  # along an axis: neighbouring pixels for which a kernel sums rays
 CHANNELS_AT_ONCE = 4  # the weights among them
 
 
@@ -205,5 +205,5 @@ class _Rays:
 
 
 def _parts(start: int, stop: int, most: int) -> list[range]:
-    """A range cut into parts of at most so many numbers."""
+    """A range cut into parts of at most ``most`` numbers."""
     return [range(at, min(at + most, stop)) for at in range(start, stop, most)]

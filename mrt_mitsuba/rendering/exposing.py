@@ -68,7 +68,7 @@ class RayBatch:
         return self.count * self.size
 
     def rays_of(self, pixels: int) -> np.ndarray:
-        """The rays in each of so many pixels, [pixels]."""
+        """Ray count per pixel, [pixels]."""
         rays = np.zeros(pixels, np.int64)
         given = self.pixels
         at = slice(given.start, given.stop) if isinstance(given, range) else given

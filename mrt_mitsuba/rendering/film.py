@@ -101,7 +101,7 @@ class SamplePattern:
         place = mi.Point2f((mi.Float(column) + x) / columns, (mi.Float(row) + y) / rows)
         if not self.time_strata:
             return place, mi.Float(0)
-        # from one ray to the next, so many parts: coprime to their number, near its golden section
+        # strata from one ray to the next: coprime to their number, near its golden section
         golden = max(round(self.time_strata * (math.sqrt(5) - 1) / 2), 1)
         stride = next(s for s in range(golden, self.time_strata + 2) if math.gcd(s, self.time_strata) <= 1)
         moments = mi.UInt64(opaque(self.time_strata))

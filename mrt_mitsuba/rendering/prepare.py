@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 class Prepared:
-    """A scene ready to be rendered: ``again(seed=…)`` is to the bit what ``mrt.render`` returns of it.
+    """A scene ready to be rendered: ``again(seed=…)`` equals ``mrt.render`` to the bit.
 
-    ``params``: its parameters by keys of ``mi.traverse``; what is set there is seen by the next picture, also
-    another size of the film. A change of what shapes the kernels, such as the first mirror, makes them anew.
+    ``params``: its parameters by keys of ``mi.traverse``. Changes of these take effect in the next
+    render, the film's size included; a change of the kernel plan, such as a first mirror, recompiles.
     """
 
     _source: Any = None  # the open scene

@@ -28,9 +28,9 @@ OF_FILMS = "RGBAW"  # channels of their own, a letter each
 
 
 class RayValues:
-    """Values along camera rays, for the rows of the table of layers; what no row reads costs nothing.
+    """Values along camera rays, read by the table of layers; computed only where a layer reads them.
 
-    ``valid``: whether the integrator found anything, Mitsuba's alpha; ``aovs``: the channels of its own;
+    ``valid``: whether the integrator found anything, Mitsuba's alpha; ``aovs``: its own channels;
     ``trace``: the result of an integrator with a ``kernel_plan``; None for any other, where Mitsuba finds the
     first hit.
     """

@@ -17,8 +17,7 @@ from mrt_mitsuba.rendering.seeds import derived_seed
 def whole_pictures(
     exposer: Exposer, seed: int, rays: int, advance: Advance
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Pictures [H, W, channels], which have so many rays a pixel in all and fit into memory, with the rays of
-    each."""
+    """Yield pictures [H, W, channels] that fit into memory, of ``rays`` spp in all, each with its own spp."""
     job = exposer.job
     film = exposer.film
     shader = exposer.shader
@@ -34,7 +33,7 @@ def whole_pictures(
             with left_to_other_threads():
                 part = derived_seed(seed, wavefront=done)
                 shader.integrator.render(shader.scene, shader.sensor, seed=part, spp=count)
-        except RuntimeError as error:  # such as a lamp that no ray can start at
+        except RuntimeError as error:  # such as an emitter that cannot be sampled
             text = " ".join(str(error).split())
             raise SceneError(f"the integrator {shader.name} cannot render this scene: {text}") from error
         raw = np.array(shader.sensor.film().develop(raw=True), np.float64)  # whatever its pixel format

@@ -41,21 +41,21 @@ class Trace:
     """Radiance of a bundle of camera rays, and by-products."""
 
     radiance: mi.UnpolarizedSpectrum
-    direct: mi.UnpolarizedSpectrum  # the part of it that needs no mirror ray
+    direct: mi.UnpolarizedSpectrum  # the part without specular reflections
     hit: Hit  # of the camera ray
-    bounces: mi.UInt32  # mirror rays traced
+    bounces: mi.UInt32  # specular reflections traced
     shadow_rays: mi.UInt32  # shadow rays traced
 
 
 @dataclass
 class Path:
-    """Paths along mirror rays, one for each camera ray: the state of the loop over bounces."""
+    """Specular paths, one for each camera ray: the state of the loop over bounces."""
 
     ray: mi.Ray3f  # the next to be traced
     throughput: mi.UnpolarizedSpectrum  # product of the mirror reflectances so far
     radiance: mi.UnpolarizedSpectrum  # light found so far
     depth: mi.UInt32  # cost of the bounces so far
-    bounces: mi.UInt32  # mirror rays traced
+    bounces: mi.UInt32  # specular reflections traced
     shadow_rays: mi.UInt32  # shadow rays traced
     active: mi.Bool  # paths that go on
     sampler: mi.Sampler  # None where all lights are points
@@ -71,7 +71,7 @@ class Sums:
 
 
 class MrtWhitted(mi.SamplingIntegrator):
-    r"""Whitted-style ray tracing: direct light, hard shadows, perfect mirror rays.
+    r"""Whitted-style ray tracing: direct light, hard shadows, perfect specular reflections.
 
     .. math::
         L(x, d) = \sum_i \mathrm{clamp}_{[0,1]}\bigl(E_i f(x, \omega_i, -d) \cos\theta_i\bigr) V_i
@@ -123,7 +123,7 @@ class MrtWhitted(mi.SamplingIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         construct_quietly(self, props)
         if props.get("hide_emitters", False):
-            raise ParameterError('mrt_whitted: "hide_emitters" is not accepted; take away the lamp\'s shape')
+            raise ParameterError('mrt_whitted: "hide_emitters" is not accepted; remove the emitter\'s shape')
         self.max_depth = integer(props, "max_depth", 10, least=1, most=2**32 - 1)
         self.sky: mi.Texture = spectrum(props, "sky", emissive=True) if "sky" in props else None
         self.clamp = flag(props, "clamp", True)

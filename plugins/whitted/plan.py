@@ -34,7 +34,7 @@ GRADIENTS = "derivatives are wanted"
 
 
 class Mirror(NamedTuple):
-    """Bounds of a material's mirror rays; inf where they are not known."""
+    """Bounds of a material's specular reflection; inf where unknown."""
 
     reflectance: float
     int_ior: float

@@ -32,7 +32,7 @@ SHADOW_EPSILON = 2.0**-14
 
 PLUGINS = __name__.removesuffix("whitted.scene_data")  # how the names of our modules begin
 
-# Length of a mirror ray: any number that float32 holds
+# Maximum length of a reflected ray: any float32
 MAX_RAY_T = 2.0**127
 
 

@@ -28,7 +28,7 @@ MOST = {
     "habits": 800,
     "index": 420,
     "ledger": 640,
-    "left_out": 280,
+    "left_out": 300,
     "limits": 640,
     "maths": 4100,
     "models": 540,
