@@ -16,7 +16,7 @@ BYTES_TO_WRITE = 4
 
 # A wavefront's arrays, per ray and channel: what the kernel writes, what is formed of it, and the part before
 BYTES_PER_CHANNEL_OF_RAY = 12
-# What filters need for every pixel under work; measured: by the blur 131, where each pixel has another amount
+# Memory of filters for each pixel in work; measured: by the blur 131, where each pixel has another amount
 # 230, by the detectors 21, copies of what they read apart
 BYTES_PER_PIXEL_OF_FILTER = 256
 

@@ -8,7 +8,7 @@ import numpy as np
 from .mesh_api import Placement, write_buffers
 from .parameters import ParameterError, bitmap
 
-# What vertices may have, and numbers for each in the bitmap: so many are used, or more given
+# Vertex attributes, and their channels in the bitmap: as many as are used, or more
 _EXTRAS = {"texcoords": (2, 3), "normals": (3,)}
 
 

@@ -48,7 +48,7 @@ UNDEFINED = {  # why a measure may be None
 
 @dataclass(frozen=True)
 class Difference:
-    """How far ``a`` is from ``b``, the reference; infinite where only one of them is."""
+    """Difference of ``a`` from ``b``, the reference; infinite where only one of them is."""
 
     mae: float  #: mean absolute error
     rmse: float  #: root of the mean squared error

@@ -1,4 +1,4 @@
-"""What a study finds while it runs: bounds, goals, tables, figures.
+"""Findings of a study while it runs: bounds, goals, tables, figures.
 
 A study is a module with ``TITLE`` and ``run(study, *, quick)``, which states findings through its ``Study``;
 ``page`` shows them.

@@ -103,7 +103,7 @@ class Point:
 
     @property
     def resolved(self) -> bool:
-        """Whether the error can be distinguished from the reference's own."""
+        """True if the error can be distinguished from the reference's own."""
         return self.rmse > RESOLVED * self.reference_error
 
     def row(self) -> Values:
@@ -153,7 +153,7 @@ class Findings:
 
     @property
     def warning(self) -> str:
-        """What the reference is too coarse for; "" if nothing."""
+        """Warning naming cases that the reference is too coarse for, else ""."""
         own = self.reference_error
         coarse = [p.name for p in self.points.values() if not p.resolved and max(p.rmse, own) > 0]
         if not coarse:
@@ -234,7 +234,7 @@ class Findings:
 
 
 def _reach(values: Array) -> float:
-    """How far Student's interval of 95 % goes to each side of the mean of values; NaN of a single one."""
+    """Half width of Student's 95 % interval of the mean of values; NaN of a single one."""
     from scipy import stats
 
     if len(values) < 2:

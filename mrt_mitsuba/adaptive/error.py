@@ -26,7 +26,7 @@ class ErrorEstimate:
 
     @property
     def whole(self) -> str:
-        """What a target in percent is a share of, in words."""
+        """The quantity of which a target in percent is a fraction."""
         return METRICS[self.metric].whole
 
     def __repr__(self) -> str:

@@ -140,7 +140,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         return len(self.aov_names()) - len(self.nested.aov_names())
 
     def _seen(self, picture: mi.TensorXf, names: list[str]) -> mi.TensorXf:
-        """What ``mi.render`` shows of a picture whose last channels have these ``names``.
+        """Picture as ``mi.render`` returns it, whose last channels have these ``names``.
 
         Of an ``aov``, it shows each integrator inside like a film; the first as the colours.
         """

@@ -158,7 +158,7 @@ class Blur(Pass):
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What a render will do: the facts known before it, and every decision made from them."""
+    """Plan of a render: the facts known before it, and every decision made from them."""
 
     scene: str  #: its number or name
     variant: str  #: of Mitsuba

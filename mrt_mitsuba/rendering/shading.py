@@ -65,7 +65,7 @@ class RayValues:
 
     @cached_property
     def found(self) -> mi.Bool:
-        """Whether rays hit anything."""
+        """True where rays hit anything."""
         return self.si.is_valid()
 
     def at_hit(self, kind: str, value: mi.Float, miss: float = 0) -> mi.Float:
@@ -159,7 +159,7 @@ class Shader:
         return [arrays, sky, self.sensor]
 
     def shift(self, time: mi.Float) -> mi.Vector3f:
-        """How far the camera has moved at a time."""
+        """Displacement of the camera at a time."""
         if self.motion is None:
             return mi.Vector3f(0)
         if mi.variant().startswith("scalar"):

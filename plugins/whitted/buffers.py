@@ -1,4 +1,4 @@
-"""Which objects are seen from a point, a light or the eye: lists of them for the cells of a cube around it.
+"""Light buffers (Haines and Greenberg 1986): cube maps of the objects seen from a light or the camera.
 
 A ray to or from the point looks up the cell that it comes through and tests the objects listed there, one or
 two of hundreds, in place of a walk down a tree. Each list begins with the object nearest to the point, and a

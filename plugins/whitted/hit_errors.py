@@ -1,4 +1,4 @@
-"""How far off its surface a hit may be: secondary rays start that much away from it.
+"""Bounds of the error of a hit: secondary rays are offset by as much.
 
 With u = 2⁻²⁴, every bound has the form δ = k u (size of the numbers that are added):
 

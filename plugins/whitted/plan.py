@@ -135,7 +135,7 @@ class PlanInput:
 
 Reasons = dict[str, bool]  # against something, by whether they hold; the first that holds is given
 
-# What is decided, and the reasons against it
+# A decision, and the reasons against it
 Decision = tuple[Any, Reasons]
 
 # What kernels hold, in words: a format of ``facts`` and ``plan``, one for each value of the field, or a
@@ -145,7 +145,7 @@ Content = str | dict[str, str] | Callable[[SceneFacts, KernelPlan], str]
 
 @dataclass(frozen=True)
 class Rule:
-    """How a decision is taken, and how it is put into words."""
+    """A rule of the kernel plan, and its words."""
 
     name: str  #: the field of the plan
     what: str  #: what is decided, in words
@@ -336,7 +336,7 @@ def _merged(case: PlanInput) -> Decision:
     return unless({case.facts.merge_obstacle: bool(case.facts.merge_obstacle)})
 
 
-#: What a decision is about, by its name
+#: Subject of each decision, by name
 WHAT = {each.name: each.what for each in RULES}
 
 

@@ -108,7 +108,7 @@ class SceneData:
         """Return the nearest hit among Mitsuba's shapes, the quadrics and the analytic planes."""
         plan = self.plan
         t, plane, on_plane = self.planes.intersect(ray, active)
-        # What lies behind a plane need not be looked for
+        # The search ends at the plane
         ray = mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths)
         si = dr.zeros(mi.SurfaceInteraction3f)
         found = mi.Bool(False)

@@ -192,7 +192,7 @@ class EmitterCase(Case):
         return lanes(call, ("Vector3f", d))
 
     def met(self, o: Array, d: Array) -> list[Array]:
-        """What rays meet of a lamp: whether, where, eval() and eval_direction() there."""
+        """Hits of rays with an emitter: mask, position, eval() and eval_direction() there."""
         seen = method(self.plugin, "eval")
         light = method(self.plugin, "eval_direction")
 
@@ -232,7 +232,7 @@ class EmitterCase(Case):
 
     @cached_property
     def spread(self) -> tuple[Array, Array]:
-        """How far ``seen`` changes as directions move by what rounding does; 0 for other lights."""
+        """Change of ``seen`` under rounding of directions; 0 for other lights."""
         s = self.samples
         if not self.around:
             return np.zeros_like(s.pdf), np.zeros_like(s.value)
@@ -333,7 +333,7 @@ def sampling(law: Outcome, case: EmitterCase) -> None:
 
 
 def _by_samples_and_by_rays(case: EmitterCase) -> float:
-    """How far the light of a lamp on points around it differs by samples and by uniform rays, relative."""
+    """Relative difference of irradiance around an emitter, by its samples and by uniform rays."""
     view = View(probe.corners(case.surface))
     o = view.around(case, case.count(2**15, 2**17))
     s = case.sample(o)

@@ -83,7 +83,7 @@ def _judge(outcome: Outcome, case: Case, obstacle: str, timeout: float) -> str:
 
 
 def _run(program: str, names: dict[str, object]) -> str:
-    """What a program prints, or the reason why it stops. Names are for those that cannot load the plugin."""
+    """Output of a program, or the reason why it stops. Names are for those that cannot load the plugin."""
     printed = io.StringIO()
     both = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed)
     with both[0], both[1], dr.scoped_set_flag(dr.JitFlag.Debug, True):

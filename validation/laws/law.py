@@ -1,4 +1,4 @@
-"""What a law of plugins is: criteria, each with its limit and reason, and the faults that it must find.
+"""Laws of plugins: criteria, each with its limit and reason, and the faults that it must find.
 
 A criterion's ``snippet`` is a program in plain Mitsuba with the numbers of its worst case: ``Case.program``
 adds the lines that load the plugin, and those that the names given to ``Outcome.check`` need.
@@ -40,7 +40,7 @@ class Skip(Exception):
 
 @dataclass(frozen=True)
 class Criterion:
-    """What a law measures, and the limit for it.
+    """A measured quantity of a law, and its limit.
 
     ``statistic``: "at least" for a number of which the limit is the least; or, of one or N errors, the
     "most", the "count" or the "share" of those that are wrong, or a quantile (a float) without NaN: at most
@@ -157,7 +157,7 @@ class Measurement:
 
     @property
     def holds(self) -> bool:
-        """Whether it is within the limit; NaN never is."""
+        """True if within the limit; NaN never is."""
         return self.measured <= self.limit if self.at_most else self.measured >= self.limit
 
     @property
@@ -174,7 +174,7 @@ class Measurement:
 
 @dataclass
 class Outcome:
-    """What was found of one law, or why it was skipped.
+    """Result of checking one law, or the reason why it was skipped.
 
     ``measured``, ``limit``, ``why`` and ``snippet`` are those of the worst criterion.
     """
@@ -275,7 +275,7 @@ class Outcome:
 
     @property
     def holds(self) -> bool:
-        """Whether every criterion is within its limit; a skipped law does not fail."""
+        """True if every criterion is within its limit; a skipped law does not fail."""
         return all(part.holds for part in self.parts) and bool(self.parts or self.skipped)
 
     @property

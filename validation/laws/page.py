@@ -62,7 +62,7 @@ class Check(Findings):
 
     @property
     def passed(self) -> bool:
-        """Whether something was checked and every law that was checked holds."""
+        """True if something was checked and every law that was checked holds."""
         return not self.failed and any(law.parts for law in self.laws.values())
 
     @property

@@ -18,7 +18,7 @@ Function = Callable[[Array], Array]
 Call = Callable[..., Any]  # its values are a Dr.Jit array, or several
 
 
-# What methods return that Mitsuba calls while it renders
+# Return types of methods that Mitsuba calls while it renders
 RETURNS = {
     "eval": ("Spectrum",),
     "pdf": ("Float",),
@@ -62,7 +62,7 @@ def corners(plugin: mi.Object) -> Array:
 
 
 def is_scalar() -> bool:
-    """Whether the current variant takes one direction at a time."""
+    """True if the current variant is scalar."""
     return mi.variant().startswith("scalar")
 
 
@@ -102,7 +102,7 @@ def at_wavelengths(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
 
 
 def _fits(value: object, kind: str) -> bool:
-    """Whether Mitsuba takes a value for a type of the current variant."""
+    """True if Mitsuba converts a value to a type of the current variant."""
     if kind not in ("Spectrum", "Float"):
         return isinstance(value, getattr(mi, kind))
     if not dr.is_array_v(value):
@@ -319,7 +319,7 @@ def without_density(value: Array, pdf: Array) -> Array:
 
 
 def excess(one: Array, other: Array, allowed: Array | float = 0.0) -> Array:
-    """How far two arrays [N, …] differ [N], beyond ``8 * allowed``, relative to the larger one.
+    """Relative difference [N] of two arrays [N, …], beyond ``8 * allowed``, relative to the larger one.
 
     The brightest channel counts as the size; below 1e-20, an exponential may have underflowed or not. What is
     not finite is left to the law ``finite``.

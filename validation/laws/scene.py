@@ -30,7 +30,7 @@ class SceneCheck(Findings):
 
     @property
     def failed(self) -> list[str]:
-        """What does not hold, as "name: law", and "pixels" where some are not finite."""
+        """Failed laws, as "name: law", and "pixels" where some are not finite."""
         laws = [f"{name}: {law}" for name, check in self.checks.items() for law in check.failed]
         return laws + (["pixels"] if self.fault else [])
 
@@ -102,7 +102,7 @@ def _plugins(scene: mi.Scene) -> dict[str, list[mi.Object]]:
 def _bad_pixels(
     scene: mi.Scene, integrator: mi.Integrator | None, sensor: mi.Sensor, spp: int, seed: int
 ) -> str:
-    """How many pixels of a picture are not finite, and where on the film the first is; "" if all are."""
+    """Number of pixels that are not finite, and the first of them on the film; "" if all are finite."""
     picture = mi.render(scene, integrator=integrator, sensor=sensor, spp=spp, seed=seed)
     bad = np.argwhere(~np.isfinite(np.array(picture)).all(axis=-1))
     if not len(bad):

@@ -192,13 +192,13 @@ class ShapeCase(Case):
 
     @cached_property
     def closed(self) -> bool:
-        """Whether most lines cross the surface an even number of times: it is closed, with holes perhaps."""
+        """True if most lines cross the surface an even number of times: closed, perhaps with holes."""
         judged, even = self.lines
         return bool(judged.sum() > MIN_QUANTILE_ERRORS and even[judged].mean() > 0.75)
 
     @cached_property
     def lines(self) -> tuple[Array, Array]:
-        """Which lines can be judged, and which cross the surface an even number of times; both [N]."""
+        """Masks of lines that can be judged, and that cross the surface an even number of times. [N], [N]"""
         clear = self.seen.met.copy()
         even = np.ones(len(clear), bool)
         last = np.full((len(clear), 3), np.inf)
@@ -210,12 +210,12 @@ class ShapeCase(Case):
 
 
 def offset(p: Array) -> Array:
-    """How far off the surface ``spawn_ray`` starts from points [N, 3]."""
+    """Offset of the origins of ``spawn_ray`` at points [N, 3]."""
     return SPAWN_OFFSET * (1 + abs(p).max(axis=1))
 
 
 def near(p: Array, q: Array) -> Array:
-    """Whether points [N, 3] are one, for all that a spawned ray can tell. [N]"""
+    """True where points [N, 3] coincide within the offset of spawned rays. [N]"""
     return norm(p - q, axis=1) < 4 * offset(p)
 
 

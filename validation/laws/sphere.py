@@ -82,7 +82,7 @@ class Cells(Lanes):
 
     @property
     def below(self) -> Array:
-        """Whether cells are of the lower hemisphere. [C]"""
+        """True for cells of the lower hemisphere. [C]"""
         return self.start >= HEMISPHERE
 
     def find(self, codes: Array) -> Array:
@@ -135,7 +135,7 @@ class Cells(Lanes):
         return r, r + width, phi, phi + 2 * np.pi * width, -1 if self.below[index] else 1
 
     def counts(self, codes: Array, weights: Array | None = None) -> Array:
-        """How many of the directions lie in each cell, or the sum of their weights. [C]"""
+        """Number of directions in each cell, or the sum of their weights. [C]"""
         return np.bincount(self.find(codes), weights, minlength=len(self.start))
 
     def integrals(self, function: Function, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -145,7 +145,7 @@ class Cells(Lanes):
         return values.mean(axis=1), values.var(axis=1) / (POINTS_PER_CELL - 1)
 
     def expected(self, density: Function, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """How many of ``count`` samples are expected in each cell, and the variance of that. [C], [C]"""
+        """Expected number of ``count`` samples in each cell, and its variance. [C], [C]"""
         share, variance = self.integrals(density, rng)
         return count * share[:, 0], count**2 * variance[:, 0]
 

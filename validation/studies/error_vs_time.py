@@ -21,7 +21,7 @@ Number = int | str  # of a scene of the report, or ``BOX``
 
 @dataclass(frozen=True)
 class Cost:
-    """How much to measure; in full by default."""
+    """Amount of work of the study; in full by default."""
 
     size: tuple[int, int] = (400, 300)  #: of pictures, pixels
     path_size: tuple[int, int] = (240, 180)  #: of those that paths make

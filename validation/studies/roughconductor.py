@@ -119,7 +119,7 @@ class RoughconductorComparison:
 
     @property
     def equal(self) -> bool:
-        """Whether neither single points nor the pictures distinguish them."""
+        """True if neither single points nor the pictures distinguish them."""
         unlikely = self.errors[P_VALUE] < LEVEL  # NaN without SciPy
         return not unlikely and all(self.errors[name] <= POINTWISE for name in NAMES)
 

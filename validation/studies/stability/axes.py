@@ -1,4 +1,4 @@
-"""How many roundings a figure is off along the axes that are hard on float32: ours, and Mitsuba's."""
+"""Errors of this project and of Mitsuba, in units of roundoff, along axes that are hard on float32."""
 
 from __future__ import annotations
 
