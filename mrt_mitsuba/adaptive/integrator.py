@@ -67,7 +67,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         others = [name for name, thing in given.items() if not isinstance(thing, mi.Integrator)]
         if others:
             known = ", ".join(PARAMETERS)
-            raise ParameterError(f'mrt_adaptive: "{others[0]}" is none of its parameters: {known}')
+            raise ParameterError(f'mrt_adaptive: "{others[0]}" is not a parameter; known: {known}')
         if len(inner) != 1 or isinstance(inner[0], MrtAdaptive):
             raise ParameterError("mrt_adaptive: give one integrator inside, such as path")
         if not isinstance(inner[0], mi.SamplingIntegrator):
@@ -134,7 +134,7 @@ class MrtAdaptive(mi.SamplingIntegrator):
         return [*theirs, *(name for name in ("error.Y", "samples.Y") if name not in theirs)]
 
     def _further(self, scene: mi.Scene, sensor: mi.Sensor | int) -> int:
-        """Number of channels that the film takes up next to those of the nested integrator."""
+        """Number of channels of the film next to those of the nested integrator."""
         if _has_bands_only(_sensor(scene, sensor).film()):
             return 0
         return len(self.aov_names()) - len(self.nested.aov_names())

@@ -1,9 +1,9 @@
-"""The random numbers of rays: samplers for Mitsuba, executed once for each variant.
+"""Samplers for Mitsuba, executed once for each variant.
 
-Each says what adaptive sampling has to know of it: ``group``, the rays of a pixel that it traces together;
-``fields``, into how many sets pixels can be divided such that the rays of one say nothing about those of
-another; ``gain``, by what power of the rays variance may fall beyond the first; and ``spacing``, between the
-numbers of rays that suit it. ``ADAPTIVE`` names the one that adaptive sampling uses.
+Each declares what adaptive sampling needs: ``group``, the rays of a pixel that are traced together;
+``fields``, the number of sets of pixels whose samples are independent of each other; ``gain``, the excess
+convergence rate: variance falls as n^−(1 + gain); and ``spacing``, between preferred sample counts.
+``ADAPTIVE`` names the one that adaptive sampling uses.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class RaySampler(mi.Sampler):
     """Draws the numbers of Mitsuba's ``independent``, with rays that need not begin with number 0.
 
     ``independent`` numbers the rays of every wavefront from 0, so that pictures would depend on how they
-    are cut into wavefronts. ``rays``: of each pixel, as ``start_in`` numbers them.
+    are cut into wavefronts. ``rays``: of each pixel, as ``seek_pixels`` numbers them.
     """
 
     group = 2
@@ -44,12 +44,12 @@ class RaySampler(mi.Sampler):
     def spacing(rays: np.ndarray) -> np.ndarray:
         return np.full_like(rays, RaySampler.group)
 
-    def start_in(self, seed: Any, pixel: Any, number: Any) -> None:
-        """Turn to rays of pixels, given their numbers among all of the pixel."""
-        self.start(seed, mi.UInt64(pixel) * mi.UInt64(opaque(self.rays)) + mi.UInt64(number))
+    def seek_pixels(self, seed: Any, pixel: Any, number: Any) -> None:
+        """Seek to the given ray indices within their pixels."""
+        self.seek(seed, mi.UInt64(pixel) * mi.UInt64(opaque(self.rays)) + mi.UInt64(number))
 
-    def start(self, seed: Any, number: Any) -> None:
-        """Turn to the rays of these numbers, or of this one in scalar variants.
+    def seek(self, seed: Any, number: Any) -> None:
+        """Seek to rays by their indices, or to one in scalar variants.
 
         ``seed``: a number, or an array of one.
         """
@@ -57,7 +57,7 @@ class RaySampler(mi.Sampler):
             seed = (seed + (number >> 32) * STRIDE) % 2**32
             state, sequence = mi.sample_tea_32(seed, number % 2**32)
         else:
-            mi.Sampler.seed(self, 0, dr.width(number))  # which only notes how many there are
+            mi.Sampler.seed(self, 0, dr.width(number))  # sets the wavefront size only
             seed = seed if dr.is_array_v(seed) else dr.opaque(mi.UInt32, seed)
             start = seed + mi.UInt32(number >> 32) * STRIDE
             state, sequence = mi.sample_tea_32(start, mi.UInt32(number))
@@ -93,12 +93,12 @@ class PixelSequence(mi.Sampler):
         Owen, 1995)."""
         return np.ldexp(np.float32(0.125), np.maximum(np.frexp(rays)[1], 4))
 
-    def start_in(self, seed: Any, pixel: Any, number: Any) -> None:
-        """Turn to rays of pixels, given their numbers among all of the pixel."""
-        self.start(number, mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, seed))[0])
+    def seek_pixels(self, seed: Any, pixel: Any, number: Any) -> None:
+        """Seek to the given ray indices within their pixels."""
+        self.seek(number, mi.sample_tea_32(pixel, dr.opaque(mi.UInt32, seed))[0])
 
-    def start(self, index: Any, key: Any) -> None:
-        """Turn to the rays with these numbers in their pixels, the pixels having these keys."""
+    def seek(self, index: Any, key: Any) -> None:
+        """Seek to the given ray indices; ``key``: scrambles the sequence of each pixel."""
         count = dr.width(index)
         mi.Sampler.seed(self, 0, count)
         # with its first bit lowest, as scrambling takes it

@@ -82,7 +82,7 @@ def save(
 
 
 def _floats(values: Any, what: str) -> Image:
-    """Return values as a float32 array; raise ``OutputError`` where they are no numbers."""
+    """Return values as a float32 array; raise ``OutputError`` if they are not numeric."""
     import numpy as np
 
     try:
@@ -95,7 +95,7 @@ def _floats(values: Any, what: str) -> Image:
 
 
 def _picture(image: Any) -> Image:
-    """Return a picture as float32 [H, W, 3]; raise ``OutputError`` if it is none."""
+    """Return a picture as float32 [H, W, 3]; raise ``OutputError`` for other shapes."""
     picture = _floats(image, "the picture")
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
         raise OutputError(f"the picture has shape {picture.shape}; expected [H, W, 3], not empty")

@@ -143,7 +143,7 @@ def lattice_samples(pattern: SamplePattern, shader: Shader, seed: Any) -> Sample
 
     def at(pixel: mi.UInt32, number: mi.UInt32, first_group: int) -> CameraSample:
         if sampler is not None:
-            sampler.start_in(seed, pixel, number)
+            sampler.seek_pixels(seed, pixel, number)
         return CameraSample(None, *pattern.at(pixel, number, shader.width, shader.height), sampler)
 
     return at
@@ -153,7 +153,7 @@ def film_samples(film: Film, seed: Any, sampler: mi.Sampler) -> Samples:
     """Return samples that a sampler of ``adaptive/samplers.py`` places in the pixels of several pictures."""
 
     def at(pixel: mi.UInt32, number: mi.UInt32, first_group: int) -> CameraSample:
-        sampler.start_in(seed, pixel, number)
+        sampler.seek_pixels(seed, pixel, number)
         inside = divide(pixel, film.pixels)[1]
         return CameraSample(*film.place(inside, sampler), None, sampler)
 

@@ -118,7 +118,7 @@ class Rounds(Pass):
     name = "rounds"
     gives = frozenset({"samples", "error", "variance", "noisy", "denoised"})
     goal: Goal
-    rmse: float | None = None  #: that the target has come to; None until a round has been traced
+    rmse: float | None = None  #: of the target; None until a round has been traced
 
     def __str__(self) -> str:
         from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
@@ -185,7 +185,7 @@ class Plan:
         return next((step for step in self.passes if isinstance(step, Blur)), None)
 
     def resolved(self, rmse: float | None, left_out: tuple[str, str] | None = None) -> Plan:
-        """Return the plan with the RMSE that its target has come to, and what the rounds left out."""
+        """Return the plan with the RMSE of its target, and what the rounds left out."""
         steps = (replace(step, rmse=rmse) if isinstance(step, Rounds) else step for step in self.passes)
         further = () if left_out is None else (left_out,)
         return replace(self, passes=tuple(steps), left_out=(*self.left_out, *further))

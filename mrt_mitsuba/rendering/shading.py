@@ -78,7 +78,7 @@ class RayValues:
 
     @property
     def distance(self) -> mi.Float:
-        """Distance of the first hit from the eye; along the ray where the sensor has no single eye."""
+        """Distance of the first hit from the camera; along the ray where the sensor has no single origin."""
         sensor = self.shader.sensor
         if sensor.class_name() not in ("PerspectiveCamera", "ThinLensCamera"):
             return self.si.t
@@ -167,7 +167,7 @@ class Shader:
         return dr.opaque(mi.Vector3f, self.motion) * time
 
     def values(self, place: mi.Point2f, time: mi.Float | None, sampler: mi.Sampler) -> RayValues:
-        """Trace rays through places in the picture, [0, 1]², for their values.
+        """Trace rays through positions in the picture, [0, 1]², for their values.
 
         ``time``: from 0, when the shutter opens, to 1; None: the sampler draws it, as for Mitsuba's sensors.
         Draws what Mitsuba's integrators draw, in their order.

@@ -1,4 +1,4 @@
-"""What an XML file comes to with its parameters and includes, bounded before Mitsuba's parser makes it."""
+"""Bounds the size of an XML file with its parameters and includes, before Mitsuba's parser expands it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from mrt_mitsuba.scene.files import require_file
 
 MAX_INCLUDES = 1000
 MAX_INCLUDE_DEPTH = 15  # of files that include each other; Mitsuba refuses more
-MAX_SUBSTITUTED = 2**24  # maximum characters that the parameters of a file come to, with those it includes
+MAX_SUBSTITUTED = 2**24  # maximum characters of the expanded parameters of a file and its includes
 
 
 @dataclass
 class Growth:
-    """What the parameters and includes of a file come to, before Mitsuba's parser makes it: parameters that
-    name each other, and files that include others many times, multiply."""
+    """Size of a file with its parameters and includes expanded: parameters that name each other, and files
+    that include others many times, multiply."""
 
     values: dict[str, str]  #: by name; ``read`` adds the defaults
     known: set[str] = field(default_factory=set)  #: names that a file uses or declares
@@ -53,7 +53,7 @@ class Growth:
         for name in sorted(filter(None, self.values), key=len, reverse=True):  # the longest first, as Mitsuba
             self.length += text.count(f"${name}") * len(self.values[name])
             if self.length > MAX_SUBSTITUTED:
-                raise RuntimeError(f"its parameters come to more than {MAX_SUBSTITUTED} characters")
+                raise RuntimeError(f"its parameters expand to more than {MAX_SUBSTITUTED} characters")
             text = text.replace(f"${name}", self.values[name])
         return text
 

@@ -288,7 +288,7 @@ def _planes(case: PlanInput) -> Decision:
     return unless({"none in the scene": case.facts.planes == 0})
 
 
-@rule("light_buffers", "light buffers", "light buffers: what may be in the way of each light")
+@rule("light_buffers", "light buffers", "light buffers: candidate occluders of each light")
 def _light_buffers(case: PlanInput) -> Decision:
     facts = case.facts
     return unless(
@@ -303,7 +303,7 @@ def _light_buffers(case: PlanInput) -> Decision:
     )
 
 
-@rule("eye_buffer", "lists around the eye", "lists around the eye: what its rays may meet")
+@rule("eye_buffer", "camera buffer", "camera buffer: candidate hits of camera rays")
 def _eye_buffer(case: PlanInput) -> Decision:
     return unless(
         {

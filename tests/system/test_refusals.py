@@ -347,7 +347,7 @@ def balls(says: str, **parameters: Any) -> None:
 
 
 spoilt("mrt_adaptive", "give one integrator inside")
-adaptive('"tarqet" is none of its parameters', tarqet=1.0)
+adaptive('"tarqet" is not a parameter', tarqet=1.0)
 adaptive('give "target" or "spp", not both', target=0.1, spp=64)
 adaptive("percentage", target="2 %")
 spoilt("mrt_bsdf", '"alpha" is nan, but must be a finite number', alpha=NAN)

@@ -48,7 +48,7 @@ def test_rays_beyond_32_bits_get_numbers_of_their_own():
     sampler = mi.load_dict({"type": "mrt_rays"})
     seen = []
     for first in (0, 2**32, 2**33):
-        sampler.start(7, dr.arange(mi.UInt64, 1000) + first)
+        sampler.seek(7, dr.arange(mi.UInt64, 1000) + first)
         seen.append(np.array(sampler.next_1d()))
     assert (seen[0] != seen[1]).all()
     assert (seen[1] != seen[2]).all()

@@ -219,7 +219,7 @@ class EmitterCase(Case):
 
     @cached_property
     def surface(self) -> mi.Scene:
-        """A scene with the shape of a lamp alone."""
+        """A scene with the emitter's shape alone."""
         return alone(self.plugin.get_shape())
 
     def from_first(self) -> mi.SurfaceInteraction3f:
@@ -301,7 +301,7 @@ def no_density_of_sample(size, ds, u):
     small=p_value("smallest p-value of counts in small cells, corrected for their number"),
     slices=p_value("smallest p-value of counts in slices of one or two degrees, corrected for their number"),
     light=most(
-        "light of a lamp by samples against by rays in all directions, relative, beyond "
+        "light of an emitter by samples, against by rays in all directions, relative, beyond "
         f"{SIGMAS} standard errors",
         1e-2,
         "one integral, of weights and of eval(): samples, densities and what is seen agree",
@@ -437,7 +437,7 @@ def finite(law: Outcome, case: EmitterCase) -> None:
 
 
 def _seen_anywhere(case: EmitterCase) -> Array:
-    """eval() where uniform rays meet a lamp, or in directions all around, [N, channels]."""
+    """eval() where uniform rays hit the emitter, or in directions all around, [N, channels]."""
     if case.lamp:
         view = View(probe.corners(case.surface))
         o = view.around(case, case.count(2**16, 2**18))

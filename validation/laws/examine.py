@@ -75,7 +75,7 @@ def _judge(outcome: Outcome, case: Case, obstacle: str, timeout: float) -> str:
         outcome.skip(f"{why}: {reason_of(why.__cause__)}" if why.__cause__ else str(why))
     except TimedOut:
         late = f"took longer than {timeout:g} s"
-        outcome.fail(f"it {late}", "a plugin must come to an end", timeout)
+        outcome.fail(f"it {late}", "a plugin must terminate", timeout)
         return f"a law before it {late}"
     except Exception as error:
         outcome.fail(f"it raised {type(error).__name__}: {reason_of(error)}", "a plugin must not raise")
