@@ -74,7 +74,7 @@ if obstacle("cuda_ad_rgb"):
 # ---------------------------------------------- Outputs ----------------------------------------------
 
 refused("out", "out.png: it is a folder; choose another name", {"out.png": None})
-refused("file/out", "is a file, not a folder; choose another place", {"file": ""})
+refused("file/out", "is a file, not a folder; choose another folder", {"file": ""})
 refused("none/out", "does not exist; create it first")
 refused("out", "links lead in a circle", {"out.exr": Path("b.exr"), "b.exr": Path("out.exr")})
 refused("export 8 --xml out.xml", "out_mesh_0.ply: it is a folder", {"out_mesh_0.ply": None})
