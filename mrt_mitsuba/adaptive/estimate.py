@@ -114,8 +114,8 @@ class SampleStatistics:
         sums = Sums(count, self.sum[:, PILOTS].sum(1), self.sum_sq[PILOTS].sum(0))
         weights: np.ndarray = np.ones(self.film.shape, np.float32)
         if self.metric is not LINEAR:
-            # chords over two standard errors of a half, as far as its values may be from the clipped range
-            deviation = 2 * np.sqrt(window_means(sums.variance, 1) / self.count[0])
+            # chords over six standard errors of a half: where a lamp's edge was missed, it may be clipped
+            deviation = 6 * np.sqrt(window_means(sums.variance, 1) / self.count[0])
             slopes = self.metric.weights(sums.mean, deviation)
             energy = np.square(sums.mean) + np.float32(1e-30)  # noise of a channel is about as large as it
             weights = (slopes * energy).sum(0) / energy.sum(0)
