@@ -184,8 +184,8 @@ def render(  # noqa: PLR0913 - each option has a name that editors show
 
 
 if render.__doc__:  # None under ``python -OO``
-    render.__doc__ += "".join(
-        f"\n        {f.name}: {f.metadata['help']} (default: {f.metadata['shown'] or f.default})."
+    render.__doc__ += "\n" + "".join(
+        f"\n    - ``{f.name}``: {f.metadata['help']} (default: {f.metadata['shown'] or f.default})."
         for f in dataclasses.fields(RenderSettings)
     )
 
