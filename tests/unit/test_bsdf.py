@@ -186,6 +186,14 @@ def test_lobes_are_chosen_by_their_mean_reflectance(diffuse, specular, share):
     assert drawn.weight.max() < 1.005 * brightest
 
 
+def test_samples_of_two_lobes_weigh_the_same():
+    """The albedo that chooses a lobe has Fresnel's reflectance in it: seen from the normal, 0.04 of gloss."""
+    b = bsdf(alpha=1e-3, fresnel="dielectric", diffuse_reflectance=0.3, specular_reflectance=0.9)
+    drawn = draw(b, at_angle(20), 10_000)
+    assert set(drawn.lobe) == {0, 1}
+    assert_allclose(drawn.weight, np.mean(drawn.weight), rtol=1e-3)
+
+
 @pytest.mark.parametrize("name", ["alpha", "int_ior", "ext_ior"])
 def test_updates_that_are_no_number_give_finite_values(name):
     made = bsdf()

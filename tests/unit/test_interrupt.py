@@ -13,6 +13,7 @@ import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba import interrupts, scene_dict
+from mrt_mitsuba.plugins.signals import left_to_other_threads
 
 
 @pytest.fixture(autouse=True)
@@ -132,3 +133,6 @@ def test_ctrl_c_is_left_to_other_threads_while_mitsuba_renders(
     assert masks
     assert all(mask == {signal.SIGINT} for mask in masks)
     assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == before == set()
+    with left_to_other_threads():  # a caller's own mask
+        render(scene, integrator=integrator, spp=4)
+        assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == {signal.SIGINT}
