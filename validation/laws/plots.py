@@ -45,21 +45,16 @@ def density(cells: Cells, seen: Array, angle: float, figure: Figure) -> None:
     np.add.at(shares[1], tuple(place), cells.mean[:, 0])
     edges = np.linspace(0, 1, side + 1)
     shares /= 2 * np.pi / side * np.diff(edges**2)[:, None]
-    top = shares.max()
     azimuth = 2 * np.pi * edges - np.pi
     axes = figure.subplots(2, 3, subplot_kw={"projection": "polar"})
-    apart = shares[0] - shares[1]
-    most = max(abs(apart).max(), 1e-12)
-    for row, half in enumerate(("above", "below")):
-        for column, name in enumerate(("samples", "pdf()")):
-            drawn = axes[row, column].pcolormesh(azimuth, edges, shares[column, row], vmin=0, vmax=top)
-            axes[row, column].set_title(f"{name}, wo {half}")
-        off = axes[row, 2].pcolormesh(azimuth, edges, apart[row], cmap="RdBu_r", vmin=-most, vmax=most)
-        axes[row, 2].set_title("samples − pdf()")
-    for each in axes.flat:
-        each.set_axis_off()
-    figure.colorbar(drawn, ax=axes[:, :2], label="density per steradian")
-    figure.colorbar(off, ax=axes[:, 2])
+    drawn = {"samples": shares[0], "pdf()": shares[1], "samples − pdf()": shares[0] - shares[1]}
+    for column, (name, values) in zip(axes.T, drawn.items(), strict=True):
+        top = abs(values).max()
+        for each, half, part in zip(column, ("above", "below"), values, strict=True):
+            mesh = each.pcolormesh(azimuth, edges, part, cmap="RdBu_r", vmin=-top, vmax=top)
+            each.set_title(f"{name}, wo {half}", fontsize="small")
+            each.set_axis_off()
+        figure.colorbar(mesh, ax=list(column), orientation="horizontal", label="per steradian")
     figure.suptitle(f"wi at {angle:.0f}° to the normal")
 
 
