@@ -167,7 +167,7 @@ stopped(_rare(0.01), 1.2, np.full(PIXELS, 1.05 + 0.01 * 198.95))
 @pytest.mark.parametrize(("draw", "target", "mean"), stopped, ids=["calm", "caustic", "rare"])
 @pytest.mark.filterwarnings("ignore::mrt_mitsuba.MrtWarning")
 def test_stopping_by_the_error_of_the_picture_keeps_the_mean(draw, target, mean):
-    """To 15 % of a picture's own standard error, of 2,000 seeds; intervals hold 90 % of the true errors, or are
+    """To 15 % of a picture's own standard error, of 2,000 seeds; intervals hold 90 % of errors, or are
     infinite."""
     results = [_render(Draws(draw), seed, target=target, rays=3000) for seed in range(2000)]
     means = np.array([result.image[..., 0].mean(dtype=float) for result in results])
