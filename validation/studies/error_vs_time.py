@@ -131,7 +131,7 @@ def path(number: Number, cost: Cost) -> Findings:
         for sampler in cost.samplers:
             sensor = nodes["sensor"] | {"sampler": {"type": sampler}}
             own = {"scene": nodes | {"sensor": sensor}, "integrator": "path"}
-            cases[f"path, {sampler} sampler, spp={spp}"] = own | {"spp": spp}
+            cases[f"path, {sampler}, spp={spp}"] = own | {"spp": spp}
         if number in CALM:
             cases[f"direct, spp={spp}"] = {"integrator": "direct", "spp": spp}
     if number in CALM:
