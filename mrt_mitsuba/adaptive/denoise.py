@@ -18,10 +18,8 @@ DENOISING_SPP = 12  # cost of denoising the two halves, in samples per pixel
 EXPECTED_RATIO = 0.4  # of the mixture's error to the plain one, before it is measured
 ERROR_DECAY = 0.75  # power of the plain error with which the error of the mixture falls
 CLOSE_ERROR = 1.1  # times the target: predicted error from which it is measured
-AIM = 0.93  # fraction of the target that a further measurement should find
-CAUTION = (
-    0.33  # part of the way from a squared error to the upper end of its interval that counts at a target
-)
+MIXTURE_MARGIN = 0.93  # fraction of the target that is aimed for once the mixture has been measured
+CAUTION = 0.33  # weight of the upper end of the interval, against the estimate, in a squared error
 
 Features = tuple[np.ndarray, np.ndarray]  #: albedo and shading normals of first hits, [H, W, 3] each
 
@@ -64,7 +62,7 @@ class Denoiser:
             quality="fast",
         )
         plain = stats.image()[..., :3].astype(np.float32)
-        more = math.sqrt(stats.curvature(stats.metric))
+        more = math.sqrt(stats.curvature)
         found = replace(
             found,
             noisy=plain,
@@ -100,7 +98,7 @@ class Denoiser:
             return target
         if self._measured is None:
             return target / EXPECTED_RATIO
-        wanted = plain_error * (AIM * target / self._predicted(plain_error)) ** (1 / ERROR_DECAY)
+        wanted = plain_error * (MIXTURE_MARGIN * target / self._predicted(plain_error)) ** (1 / ERROR_DECAY)
         samples = spp * (plain_error / wanted) ** 2 + DENOISING_SPP
         if samples >= spp * (plain_error / target) ** 2:
             self.left_out = f"the mixture needs {samples:.0f} samples per pixel, as many as without it"

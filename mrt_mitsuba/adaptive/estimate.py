@@ -28,6 +28,7 @@ from mrt_mitsuba.rendering.film import Film
 HALVES, PILOTS = [0, 1], [2, 3]
 WINDOWS = (2, 8)  # radii of the windows that pixels borrow variance from, in pixels
 UNSEEN_PSEUDOCOUNT = 0.25  # noisy pixels that are assumed to be among the others, unseen
+SLOPE_DEVIATIONS = 6  # standard errors of a half over which a metric's slope is taken
 PRIOR_WEIGHT = 2  # squared errors that an estimated variance counts as much as
 SUBSET_PIXELS = 2**12  # pixels, about, from which mixtures, quantiles and factors are found
 NOISE_FIELDS = 16  # pictures of noise that are blurred to estimate the variance after a blur
@@ -114,8 +115,8 @@ class SampleStatistics:
         sums = Sums(count, self.sum[:, PILOTS].sum(1), self.sum_sq[PILOTS].sum(0))
         weights: np.ndarray = np.ones(self.film.shape, np.float32)
         if self.metric is not LINEAR:
-            # chords over six standard errors of a half: where a lamp's edge was missed, it may be clipped
-            deviation = 6 * np.sqrt(window_means(sums.variance, 1) / self.count[0])
+            # a pixel at the edge of a light may have missed it: the clipped end of the metric is in reach
+            deviation = SLOPE_DEVIATIONS * np.sqrt(window_means(sums.variance, 1) / self.count[0])
             slopes = self.metric.weights(sums.mean, deviation)
             energy = np.square(sums.mean) + np.float32(1e-30)  # noise of a channel is about as large as it
             weights = (slopes * energy).sum(0) / energy.sum(0)
@@ -166,16 +167,20 @@ class SampleStatistics:
 
         They are 0 where the picture is invalid.
         """
-        squares = metric.squared_errors(*self.half_pictures(blurred)) * self.curvature(metric)
+        squares = metric.squared_errors(*self.half_pictures(blurred))
+        if metric is self.metric:
+            squares = squares * self.curvature
         return np.where(self.unknown(REACH if blurred else 0)[..., None], 0, squares)
 
-    def curvature(self, metric: Metric) -> float:
+    @cached_property
+    def curvature(self) -> float:
         """Factor to squared errors from the difference of the halves, for the curvature of the metric.
 
         The difference of two noisy halves is encoded less steeply than that of their mean to the dark truth.
         Of pilots, which are noisier, the factor is known, as their mean differs from that of the halves by
         its true error; it falls about as the root of the rays grows.
         """
+        metric = self.metric
         if metric is LINEAR:
             return 1.0
         if self.pilots is None:

@@ -196,13 +196,13 @@ def plan_round(
         return None
     wanted = TARGET_MARGIN * target / (caution * now.rmse)
     # growth of the ray count if spread evenly, and if allocated by the pilots' noise, which promises too much
-    alike = wanted**-2
-    in_shares = allocator.required_spp(stats, seen, max(wanted * seen.rmse, 1e-100)) / now.spp
-    growth = math.sqrt(alike * in_shares) ** (1 / (1 + allocator.gain))
-    return _some(allocator, stats, seen, min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1)), most)
+    uniform = wanted**-2
+    adaptive = allocator.required_spp(stats, seen, max(wanted * seen.rmse, 1e-100)) / now.spp
+    growth = math.sqrt(uniform * adaptive) ** (1 / (1 + allocator.gain))
+    return _nonempty(allocator, stats, seen, min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1)), most)
 
 
-def _some(
+def _nonempty(
     allocator: Allocator, stats: SampleStatistics, seen: Forecast, spp: float, most: float
 ) -> np.ndarray:
     """Return an allocation that raises the mean to ``spp``, or further where whole groups exceed that."""

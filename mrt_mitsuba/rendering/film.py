@@ -161,17 +161,21 @@ class Film:
         place = mi.Point2f(mi.Float(column), mi.Float(row)) + sampler.next_2d()
         return place, (place - opaque(border)) / size
 
+    @property
+    def _offsets(self) -> np.ndarray:
+        """Positions along an axis from the filter's centre, in pixels, where ``weights`` are taken."""
+        pixels = np.arange(-self.reach, self.reach + 1)[:, None]
+        return pixels + (np.arange(FILTER_STEPS_PER_PIXEL) + 0.5) / FILTER_STEPS_PER_PIXEL - 0.5
+
     @cached_property
     def weights(self) -> np.ndarray:
         """Values of the filter along an axis, [pixels in its reach, ``FILTER_STEPS_PER_PIXEL``]."""
-        pixels = np.arange(-self.reach, self.reach + 1)[:, None]
-        places = pixels + (np.arange(FILTER_STEPS_PER_PIXEL) + 0.5) / FILTER_STEPS_PER_PIXEL - 0.5
-        flat = places.ravel().tolist()
+        flat = self._offsets.ravel().tolist()
         if mi.variant().startswith("scalar"):
             values = [self.rfilter.eval(place) for place in flat]
         else:  # a list is copied; for NumPy's memory, Dr.Jit would compile a kernel for every alignment
             values = self.rfilter.eval(mi.Float(flat))
-        return np.asarray(values, np.float64).reshape(places.shape)
+        return np.asarray(values, np.float64).reshape(self._offsets.shape)
 
     @property
     def correlation(self) -> float:
@@ -200,9 +204,7 @@ class Film:
         A mean over a pixel is wide already; the taps add the rest of the filter's second moment.
         """
         share = self.weights / self.weights.sum()
-        steps = self.weights.shape[1]
-        offset = np.arange(-self.reach, self.reach + 1)[:, None] + (np.arange(steps) + 0.5) / steps - 0.5
-        beside = (float((share * offset**2).sum()) - 1 / 12) / 2
+        beside = (float((share * self._offsets**2).sum()) - 1 / 12) / 2
         for axis in (0, 1) if self.reach else ():
             padded = np.pad(means, [(int(axis == k),) * 2 for k in range(3)], mode="edge")
             wide = sliding_window_view(padded, 3, axis)

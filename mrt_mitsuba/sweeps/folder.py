@@ -37,8 +37,6 @@ def reserved(folder: str) -> Iterator[None]:
         try:
             yield
         finally:
-            for left in (
-                Path(path),
-                *Path(folder).glob(TEMPORARY.format("*")),
-            ):  # of workers that were killed
+            Path(path).unlink(missing_ok=True)
+            for left in Path(folder).glob(TEMPORARY.format("*")):  # by workers that were killed
                 left.unlink(missing_ok=True)

@@ -88,11 +88,11 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
         user_plugins.load(modules)
         table = Table(folder, named)
         planned = jobs(scene, named, dict(options), [user_plugins.digest(name) for name in modules])
-        whole = {job.name for job in planned if is_fresh(job, folder, job.file in table.earlier)}
-        missing = [job for job in planned if not (job.name in whole and resume)]
+        fresh = {job.name for job in planned if is_fresh(job, folder, job.file in table.earlier)}
+        kept = fresh if resume else set()
+        missing = [job for job in planned if job.name not in kept]
         check_parameters(missing)
         versions = describe(folder)["versions"]
-        kept = {job.name for job in planned} - {job.name for job in missing}
         for job in planned:
             if job.name in kept:
                 known = table.earlier.get(job.file, {})

@@ -71,7 +71,8 @@ def ablate(study: Study, *, size: int, rays: int, seeds: int, kinds: Sequence[st
     rows: list[Values] = []
     for name in study.each("Ablation", list(changed)):
         row: Values = {"stage": name}
-        errors, tenths = list[float](), list[float]()
+        errors = list[float]()
+        tenths = list[float]()
         for kind, scene in scenes.items():
             with ExitStack() as changes:
                 for change in changed[name]:
