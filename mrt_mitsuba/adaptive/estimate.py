@@ -339,7 +339,7 @@ def ray_variance(
     mixed = np.tensordot(weights.astype(np.float32), more, 1)
     quiet, also = window_means(np.stack([seen, measured]), 1) == 0
     if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
-        mixed[quiet & also & ~_edges((first + second).mean.mean(0))] = 0
+        mixed[quiet & also] = 0
     mixed[..., stats.scale == 0] = 0
     every = differences(first, second)
     found, expected = window_means(every, WINDOWS[-1]) + 0.2 * every.mean((-2, -1), keepdims=True)
@@ -362,15 +362,6 @@ def _between_pixels(stats: SampleStatistics) -> float:
     seen = np.where(stats.invalid_dilated, 0, squares).mean()
     added = seen / film.filter_variance_ratio - film.between_pixel_share * found
     return float(np.clip(added / max(expected, 1e-300), 0, 1 - film.between_pixel_share))
-
-
-def _edges(means: np.ndarray) -> np.ndarray:
-    """Return where means [H, W] differ from a neighbour's: few rays may all have missed what lies between."""
-    differ = np.zeros(means.shape, bool)
-    limit = np.float32(1e-5) * np.abs(means)  # rounding of sums
-    differ[:, 1:] = np.abs(np.diff(means, axis=1)) > limit[:, 1:]
-    differ[1:] |= np.abs(np.diff(means, axis=0)) > limit[1:]
-    return dilated(differ, 1)
 
 
 def _around(film: Film, values: np.ndarray) -> np.ndarray:
