@@ -136,8 +136,8 @@ class Axial:
     def surface(self, p, part, frame: Frame):
         """Put a point near the given part onto it by a Newton step along the normal.
 
-        Returns the point, the outward unit normal and the texture coordinates. At an apex the normal is that
-        of one of the generatrices.
+        ``frame``: to the quadric's own coordinates. Returns (point, outward unit normal, u, v). At an apex
+        the normal is that of one of the generatrices.
         """
         q = frame.point(p)
         r = dr.sqrt(dr.square(q.x) + dr.square(q.y))

@@ -112,7 +112,7 @@ def _drawn(content: Any) -> Values:
 
 
 def cell(value: object) -> str:
-    """Return a value as people read it: floats to four digits, a dash for an unknown one."""
+    """Return a value as text: four significant digits, yes or no, a dash for None and NaN."""
     if value is None or value != value:
         return "–"
     if isinstance(value, bool):

@@ -196,8 +196,8 @@ def _weighted(
 ) -> Sequence[Float]:
     """The weighted sums of each plane's values along lines.
 
-    ``line``: the index of its first value, the stride to the next, their number, and the k of the weights.
-    ``place``: where in the planes the values are that have these indices.
+    ``line``: the index of its first value, the stride to the next, their number, and k: the weights are the
+    line of Pascal's triangle with 2k entries. ``place``: positions in the planes by index; None: the indices.
     """
     first, stride, count, k = line
     pascal = grid.Float(_PASCAL)

@@ -17,7 +17,10 @@ from mrt_mitsuba.rendering.seeds import derived_seed
 def whole_pictures(
     exposer: Exposer, seed: int, rays: int, advance: Advance
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield pictures [H, W, channels] that fit into memory, of ``rays`` spp in all, each with its own spp."""
+    """Yield (spp, picture [H, W, channels]) of passes that fit into memory, with about ``rays`` spp in all.
+
+    The spp of a pass are as the scene's sampler rounds them.
+    """
     job = exposer.job
     film = exposer.film
     shader = exposer.shader

@@ -18,7 +18,7 @@ MISSING = "is missing or may not be read in"  # text of messages about missing f
 
 
 def require_file(path: StrPath) -> None:
-    """Raise ``SceneError`` unless ``path`` is a file that may be read: pipes and devices may never end."""
+    """Raise ``SceneError`` unless ``path`` is a regular file with permission to read: pipes may never end."""
     name = os.fspath(path)
     problem = ""
     try:

@@ -80,8 +80,8 @@ def load_file(
     Raises ``SceneError``, and ``UsageError`` for another kind of file, a parameter or key that is not in it,
     or a texture too large for the budget.
     """
+    from mrt_mitsuba.scene.expansion import Expansion
     from mrt_mitsuba.scene.files import require_file
-    from mrt_mitsuba.scene.growth import Growth
 
     require_file(path)
     if not path.lower().endswith(".xml"):
@@ -91,22 +91,22 @@ def load_file(
     given = {name: str(value) for name, value in params.items() if name not in keys}
     offered = {name: str(value) for name, value in (options or {}).items() if value is not None} | given
     with _loading(path, os.path.dirname(path) or "."):
-        growth = Growth(dict(offered))
-        growth.read(path)
-        _check_parameters(path, given, growth.known)
+        expansion = Expansion(dict(offered))
+        expansion.read(path)
+        _check_parameters(path, given, expansion.known)
         config = mi.parser.ParserConfig(mi.variant())
         config.unused_parameters = mi.LogLevel.Debug  # a file has few of the options
         state = mi.parser.parse_file(config, path, **offered)
         budget.inputs.update(map(str, state.files))
         _check_nodes(state.nodes, budget)
         if not as_text:
-            return _instantiate(state, True, keys), growth.values
+            return _instantiate(state, True, keys), expansion.values
         for node in state.nodes:
             if isinstance(node.props.get("filename", None), str):
                 node.props["filename"] = os.path.abspath(_resolved(node.props["filename"]))
         if strange := _set_properties(state, keys):
             raise UsageError(f"{path} does not state {min(strange)}: write it into the file")
-        return mi.parser.write_string(state), growth.values
+        return mi.parser.write_string(state), expansion.values
 
 
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------

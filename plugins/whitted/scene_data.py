@@ -144,7 +144,10 @@ class SceneData:
     def occluded(
         self, hit: Hit, light: int | mi.UInt32, ds: mi.DirectionSample3f, active: mi.Bool
     ) -> mi.Bool:
-        """True if anything blocks the segment from ``hit`` to the sample ``ds`` of a light."""
+        """True if anything blocks the segment from ``hit`` to the sample ``ds`` of a light.
+
+        ``light``: its number, which chooses its light buffer. Lanes that are not active may be anything.
+        """
         o = self._off_surface(hit, ds.d)
         to_light = ds.p - o
         blocked = self.planes.separate(o, o + to_light * (1 - SHADOW_EPSILON))
@@ -179,8 +182,10 @@ class SceneData:
     def eval_bsdf(
         self, hit: Hit, wos: list[mi.Vector3f], facing: list[mi.Bool], mirror: bool
     ) -> tuple[list[mi.UnpolarizedSpectrum], mi.UnpolarizedSpectrum, mi.Float]:
-        """Return the values f cos θo at ``hit`` towards ``wos``, the mirror reflectance and its index of
-        refraction: all of it in one call.
+        """Return the values f cos θo at ``hit`` towards ``wos``, the reflectance of the mirror, and the index
+        of refraction of the BSDF, all by one dispatch.
+
+        ``facing``: the lanes in which each direction is evaluated. ``mirror``: are the last two wanted.
         """
         context = context_of(self.plan.lobes)
         arguments = (hit.si, wos, facing, hit.found)

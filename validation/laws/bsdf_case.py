@@ -185,10 +185,10 @@ def _indices(wi: Array, wo: Array, eta: Array) -> Array:
 
 
 def live(s: Lanes, value: Array, pdf: Array) -> Array:
-    """Where samples come from lobes with a width and count for the density. [N], bool
+    """Where samples are to be counted against pdf(): not delta, of positive density, not refused. [N], bool
 
-    Weight 0 is how ``sample`` refuses: its direction is then any, or on the wrong side. It may also be that
-    the value is 0 there, or that the weight is wrong; but then the stated density is that of the direction.
+    Refused: the weight is 0 though the value is not, and the direction is on the wrong side or the stated
+    density is not pdf(). With the right density and side, a weight of 0 is wrong, and the sample counts.
     """
     crosses = s.wi[:, 2] * s.wo[:, 2] < 0
     wrong = np.where(crosses, mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission)

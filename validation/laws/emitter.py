@@ -391,7 +391,7 @@ def _directions(case: EmitterCase, u: Array) -> Array:
     seen=most(f"eval() where it is seen against eval_direction(), {BEYOND}", REEVALUATION_TOL, "one number"),
 )
 def weights(law: Outcome, case: EmitterCase) -> None:
-    """weight · pdf is ``eval_direction``, the light that is seen there."""
+    """weight · pdf is ``eval_direction``, and so is ``eval`` where a ray meets the emitter."""
     s = case.samples
     allowed = case.spread[1]
     counts = s.lit & (s.pdf > 0) & np.isfinite(s.weight).all(axis=1)

@@ -386,7 +386,7 @@ def slit_above(size, si, ray):
     ),
 )
 def watertight(law: Outcome, case: ShapeCase) -> None:
-    """Lines enter and leave in turn, and no ray escapes from inside."""
+    """Rays meet the surface from behind, lines cross it an even number of times, none escapes from inside."""
     met = case.met
     # else such a ray may fall off an edge, or its offset be larger than the shape
     steep = (abs(met.cos) > 0.5) & (offset(met.p) < 1e-3 * case.size)

@@ -18,8 +18,8 @@ MAX_SUBSTITUTED = 2**24  # maximum characters of the expanded parameters of a fi
 
 
 @dataclass
-class Growth:
-    """Size of a file with its parameters and includes expanded: parameters that name each other, and files
+class Expansion:
+    """Bounds the expansion of a file's parameters and includes: parameters that name each other, and files
     that include others many times, multiply."""
 
     values: dict[str, str]  #: by name; ``read`` adds the defaults
