@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import OutputError, needs_extra
+from mrt_mitsuba.errors import needs_extra
 from mrt_mitsuba.files.images import png
-from mrt_mitsuba.files.replacing import check_target, replacing
+from mrt_mitsuba.files.replacing import check_target, make_folder, replacing
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.validation.study import Study, Values
 
@@ -43,11 +43,7 @@ def prepare_folder(folder: Path, *names: str, inputs: Sequence[str] = ()) -> Non
 
     The names default to those of a report; no file may be one of the ``inputs``. Raises ``OutputError``.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # also of a zero byte, or a lone surrogate
-        why = getattr(error, "strerror", None) or error
-        raise OutputError(f"cannot make the folder {folder}: {why}; choose another") from error
+    make_folder(folder)
     for name in names or ("summary.json", "index.html"):
         check_target(folder / name, inputs)
 

@@ -98,6 +98,17 @@ def _target(path: StrPath, inputs: Iterable[StrPath]) -> str:
     return target
 
 
+def make_folder(folder: StrPath) -> str:
+    """Return the absolute path of a folder, made if need be. Raises ``OutputError``."""
+    try:
+        path = os.path.abspath(os.fsdecode(folder))
+        os.makedirs(path, exist_ok=True)
+    except (OSError, TypeError, ValueError) as error:  # also of a zero byte, or a lone surrogate
+        why = getattr(error, "strerror", None) or error
+        raise OutputError(f"cannot make the folder {folder!s}: {why}; choose another") from error
+    return path
+
+
 @contextlib.contextmanager
 def _temporary(folder: str) -> Iterator[IO[bytes]]:
     """Give a new file in a folder, with the rights of the user's umask; remove it at the end."""

@@ -8,7 +8,8 @@ from contextlib import ExitStack, closing
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba import runtime, user_plugins
-from mrt_mitsuba.errors import OutputError, UsageError, needs_extra
+from mrt_mitsuba.errors import UsageError, needs_extra
+from mrt_mitsuba.files.replacing import make_folder
 from mrt_mitsuba.options import StrPath, Values, check, integer
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 from mrt_mitsuba.sweeps.folder import reserved
@@ -75,12 +76,7 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
     if current not in (None, "", runtime.FAST) and "variant" not in (grid or {}):
         options.setdefault("variant", current)  # workers use the variant that ``render`` would
     named = points({} if grid is None else grid, zipped)
-    try:
-        folder = os.path.abspath(os.fsdecode(out))
-        os.makedirs(folder, exist_ok=True)
-    except (OSError, TypeError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise OutputError(f"cannot make the folder {out!s}: {reason}") from error
+    folder = make_folder(out)
     shown = TerminalProgress(unit=" pictures") if progress is None else progress
     modules = user_plugins.plugin_names(plugins)
     with reserved(folder):
