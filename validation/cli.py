@@ -28,11 +28,6 @@ STUDIES = {
     "stock": ("are light, gloss and mirrors what Mitsuba computes", 15, 60),
     "scenes": ("are the report's scenes right, with a reason for each pixel off", 10, 60),
     "adaptive": ("what does an error cost next to the best sampler", 90, 1500),
-    "honest": (
-        "is the mean unbiased, and the reported error right, also with heavy tails",
-        20,
-        1200,
-    ),
     "stability": ("where must float32 give out, and where does it not", 16, 150),
     "error-vs-time": ("what does each setting buy for its time", 9, 1200),
     "needs": ("what do scenes not need, and what would it cost", 9, 60),

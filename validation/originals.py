@@ -5,18 +5,11 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-import mrt_mitsuba as mrt
 from mrt_mitsuba.files.images import read_exr
-from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.validation import plotting
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -59,29 +52,3 @@ def read_original(path: str | os.PathLike[str]) -> Original:
         bits=int(picture.header.get("mrt:bits", 24)),  # of a float32
         layers=dict(picture.layers),
     )
-
-
-def side_by_side(folder: str | os.PathLike[str]) -> tuple[Figure, list[dict[str, Any]]]:
-    """Draw scenes 0 to 4 by the original program, by ours, and their difference times 100.
-
-    Also return a row for each scene.
-    """
-    rows = []
-    drawn, plots = plotting.panels(5, 3, 7.2, 9.4)
-    for scene, row in enumerate(plots):
-        original = read_original(Path(folder) / f"s{scene}_none_aa4.exr")
-        result = mrt.render(original.scene, fresnel="dielectric", progress=Progress(), **original.options)
-        ours = original.like(result.image)
-        difference = np.abs(ours - original.image)
-        shown = {
-            f"scene {scene}, 2020": original.image,
-            "this project": ours,
-            "difference × 100": 100 * difference,
-        }
-        for axes, (title, picture) in zip(row, shown.items(), strict=True):
-            plotting.show_picture(axes, picture)
-            axes.set_title(title, loc="left")
-        off = f"{(difference.max(axis=-1) > 1 / 255).mean():.2%}"
-        mean = float(difference.mean())
-        rows.append({"scene": scene, "mean difference": mean, "pixels off by > 1/255": off})
-    return drawn, rows

@@ -11,11 +11,12 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import chromium  # next to this file
 import numpy as np
 import rooms
+from matplotlib.figure import Figure
 from PIL import Image
 
 import mrt_mitsuba as mrt  # first: it chooses the LLVM library
@@ -23,12 +24,10 @@ import mrt_mitsuba as mrt  # first: it chooses the LLVM library
 # isort: split
 import mitsuba as mi
 
+from mrt_mitsuba.files import to_8bit
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.validation import plotting, work_precision
+from mrt_mitsuba.validation import work_precision
 from mrt_mitsuba.validation.studies import error_vs_time
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 HERE = Path(__file__).parent
 SAMPLERS = ("independent", "stratified", "multijitter", "ldsampler")  # of Mitsuba
@@ -96,13 +95,15 @@ def equal_time(quick: bool) -> Image.Image:
             spp = max(round(spp * seconds / took), 1)
         rivals.append((mrt.compare(image, truth).display, f"mi.render, {sampler}", took, image))
     _, best, took, image = min(rivals)
-    drawn, plots = plotting.panels(1, 3, 10.4, 4.0)
+    drawn = Figure(figsize=(10.4, 4.0), layout="constrained")
     shown = {f"{best}: {took:.2f} s": image, f"mrt.render, denoised: {seconds:.2f} s": result.image}
-    for axes, (name, picture) in zip(plots[0], (shown | {"converged": truth}).items(), strict=True):
-        plotting.show_picture(axes, picture, "srgb")
+    shown["converged"] = truth
+    for axes, (name, picture) in zip(drawn.subplots(1, 3), shown.items(), strict=True):
+        axes.imshow(to_8bit(np.float32(picture), "srgb"), interpolation="nearest")
+        axes.set_axis_off()
         found = mrt.compare(picture, truth)
         error = "" if picture is truth else f"\nFLIP {found.flip:.3f}, display RMSE {found.display:.3f}"
-        axes.set_title(name + error, loc="left")
+        axes.set_title(name + error, loc="left", fontsize=10)
     return rasterized(drawn)
 
 

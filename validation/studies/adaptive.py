@@ -1,7 +1,7 @@
 """Adaptive sampling: what an error costs next to the best of Mitsuba's samplers, and does a render end at it?
 
 In two metrics, that of linear values and that of a display, plain and denoised. ``ablation`` says what each
-stage brings, and ``honest`` whether stated errors are true, and means unbiased.
+stage brings.
 """
 
 from __future__ import annotations
