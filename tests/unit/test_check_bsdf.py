@@ -123,7 +123,7 @@ STOCK = {
     "plastic": ({}, {"gradients"}),
     "roughdielectric": ({"alpha": 0.2}, set()),
     "roughconductor": ({"distribution": "ggx"}, set()),
-    "roughplastic": ({}, {"sampling", "finite", "gradients"}),
+    "roughplastic": ({}, {"sampling", "finite", "gradients", "variants"}),
     "twosided": ({"nested": {"type": "diffuse"}}, {"components"}),
     "mask": ({"opacity": {"type": "checkerboard"}, "nested": {"type": "roughconductor", "alpha": 0.3}},
              {"components"}),

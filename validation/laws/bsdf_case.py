@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import cached_property
 
 import drjit as dr
@@ -14,32 +13,12 @@ import numpy as np
 from . import probe
 from .case import Case, Given
 from .law import Skip, UsageError
-from .probe import DIRECTION_EPS, Array, Function, Lanes, Probe, excess, is_scalar, joined, unit
-from .sphere import MAX_LEVEL, POINTS_PER_CELL, Cells, encode, integrate
+from .probe import DIRECTION_EPS, Array, Lanes, Probe, excess, joined, unit
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
 QUICK_ANGLES = (0, 50, 85, 140)
-G1_FIT_ERROR = 5e-3  # rational fits of Smith's G₁ are off by up to 0.35 %, and densities with them
 POINTWISE_TOL = 2e-3  # relative, beyond what rounding explains
-MAX_UNRESOLVED_SHARE = 0.02  # of samples in cells that quadrature does not resolve; usually 0.001
 MIN_LOBE_WIDTH = 16 * DIRECTION_EPS  # width of a lobe that rounded directions do not resolve
-
-
-@dataclass
-class View:
-    """Samples of a BSDF for one direction of incidence. The first quarter are pilots: they make the cells.
-
-    ``density`` is pdf() at the samples that count, of lobes with a width and not refused; 0 elsewhere.
-    """
-
-    at: Lanes  # wi [3] and uv [2]
-    samples: Lanes  # [N]
-    density: Array  # [N]
-    pilot: Array  # directions of the pilots that count [P, 3]
-    codes: Array  # cells of the others that count [C]
-    count: int  # of the others
-    share: float  # of the others that count
-    holes: float  # share of samples at which eval() is not finite
 
 
 class BsdfCase(Case, Probe):
@@ -54,73 +33,37 @@ class BsdfCase(Case, Probe):
             kind = type(self.plugin).__name__
             raise UsageError(f"{kind} is not a BSDF of {mi.variant()}: give a dict or a loaded BSDF")
 
+    @property
+    def angles(self) -> tuple[int, ...]:
+        """Angles of incidence in degrees."""
+        return QUICK_ANGLES if self.quick else ANGLES
+
     @cached_property
-    def views(self) -> list[View]:
-        """Samples for directions of incidence at all angles."""
+    def views(self) -> list[Lanes]:
+        """Samples for a direction of incidence at each angle.
+
+        ``density`` is pdf() at the samples that count, of lobes with a width and not refused; 0 elsewhere.
+        """
         views = []
-        for angle in QUICK_ANGLES if self.quick else ANGLES:
+        for angle in self.angles:
             wi = probe.direction(np.cos(np.radians(angle)), self.rng.uniform(0, 2 * np.pi))
-            at = Lanes(wi=wi, uv=self.uniform(2))
             u = self.uniform(self.count(2**16, 2**19), 3)
-            samples = self.sample(Lanes(wi=np.tile(wi, (len(u), 1)), uv=np.tile(at.uv, (len(u), 1)), u=u))
+            at = Lanes(wi=np.tile(wi, (len(u), 1)), uv=np.tile(self.uniform(2), (len(u), 1)), u=u)
+            samples = self.sample(at)
             value, pdf = self.both(samples)
-            density = np.where(live(samples, value, pdf), pdf, 0)
-            holes = (density > 0) & ~np.isfinite(value).all(axis=1)
-            first = len(u) // 4
-            pilot = samples.wo[:first][density[:first] > 0]
-            codes = encode(samples.wo[first:][density[first:] > 0])
-            count = len(u) - first
-            share = len(codes) / count
-            views.append(View(at, samples, density, pilot, codes, count, share, holes.mean()))
+            views.append(samples.having(density=np.where(live(samples, value, pdf), pdf, 0)))
         return views
-
-    @cached_property
-    def cells(self) -> list[Cells | None]:
-        """For each view, cells that resolve the density, with its integrals; None where none do."""
-        return [self._cells(view) for view in self.views]
-
-    def density_at(self, view: View) -> Function:
-        """The density of directions [M, 3] in a view, as a function."""
-
-        def density(wo: Array) -> Array:
-            return np.maximum(self.pdf(view.at.having(wo=wo)), 0)
-
-        return density
-
-    def _cells(self, view: View) -> Cells | None:
-        # around the mirror direction at all scales, where lobes may be that are not sampled
-        scales = 10 ** self.rng.uniform(-4, 0, (600, 1))
-        mirrored = view.at.wi * [-1, -1, 1] + scales * self.rng.normal(size=(600, 3))
-        seeds = encode(np.concatenate([view.pilot, unit(mirrored)]))
-        most = max(len(view.density) // 4000, 8)
-        cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
-        crowd = cells.counts(encode(view.pilot))
-        crowded = (crowd * ((cells.level == MAX_LEVEL) & (crowd > 4 * most))).sum()
-        # at the normal, all azimuths of the finest cells are one place
-        radius = np.hypot(*view.pilot.T[:2])
-        centre = (radius < np.sqrt(2) * 0.5**MAX_LEVEL).sum()
-        if max(crowded, centre) > 0.01 * len(view.pilot):  # samples are closer together than the finest cells
-            return None
-        integrals = integrate(self.density_at(view), cells, self.rng, view.codes, view.count)
-        # samples in cells where fewer than two of the cell's points are expected within the lobe
-        density_there = view.density[-view.count :]
-        weights = 1 / (view.count * density_there[density_there > 0])
-        covered = integrals.counts(view.codes, weights)
-        coarse = covered * POINTS_PER_CELL < 2 * integrals.solid_angle
-        overlooked = integrals.counts(view.codes)[coarse].sum() / view.count
-        known = integrals.mean.sum() > view.share or overlooked < MAX_UNRESOLVED_SHARE
-        return integrals if known else None
 
     @cached_property
     def drawn(self) -> Lanes:
         """The first samples of all views."""
         few = self.count(2**12, 2**13)
-        return joined([view.samples[:few] for view in self.views])
+        return joined([view[:few] for view in self.views])
 
     @cached_property
     def incidence(self) -> Lanes:
-        """The directions of incidence ``wi`` and texture coordinates ``uv`` of all views."""
-        return joined([view.at[np.newaxis] for view in self.views])
+        """The first sample of each view, with its ``wi`` and ``uv``."""
+        return joined([view[:1] for view in self.views])
 
     def copy(self) -> BsdfCase:
         """A case whose parameters can be changed, with a BSDF of its own if it can be loaded."""

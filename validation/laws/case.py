@@ -21,6 +21,7 @@ Description = dict[str, Any]  # of a plugin, as ``mi.load_dict`` takes it
 Given = Any  # such a dict, a value of one, or a loaded plugin
 Result = TypeVar("Result")
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
+WAVE = 2**20  # lanes that are checked at a time for results that are not finite
 # By package, lines of a program that register its plugins: the first before Mitsuba is imported
 PREAMBLES: dict[str, tuple[str, str]] = {}
 
@@ -89,6 +90,11 @@ class Case:
         """The number of lanes to use."""
         number = quick if self.quick else full
         return max(int(number * SCALAR_SHARE), 64) if is_scalar() else number
+
+    @property
+    def waves(self) -> range:
+        """One for each wave of lanes in which rare faults show; none in scalar variants."""
+        return range(self.count(WAVE, 4 * WAVE) // WAVE)
 
     def few(self, lanes: Lanes, quick: int, full: int) -> Lanes:
         """The first of some lanes."""
@@ -176,34 +182,6 @@ def reads_checked(law: Outcome) -> Iterator[None]:
     for line in lines:
         if line not in reads:
             print(line, file=sys.stderr)
-
-
-def judge_many(
-    law: Outcome, case: Case, call: Callable[[Callable[[], mi.Float]], tuple[mi.Mask, dict[str, mi.Point3f]]]
-) -> None:
-    """Check ``million`` on so many lanes that a fault in one of a hundred thousand shows.
-
-    ``call(draw)`` gives the lanes that are bad, and what else snippets show of the first of them, in terms of
-    random numbers that ``draw()`` makes. Scalar variants are too slow for this.
-    """
-    if is_scalar():
-        return
-    count = case.count(2**20, 2**22)
-    # random numbers of which each has one in every 1 / count: faults in any wider slice of one are met
-    sampler = mi.load_dict({"type": "stratified", "sample_count": count})
-    sampler.set_samples_per_wavefront(count)
-    sampler.seed(case.seed + 1, count)  # 1 finds the least faults that the table of power states
-
-    def draw() -> mi.Float:
-        return dr.minimum(sampler.next_1d(), dr.one_minus_epsilon(mi.Float))
-
-    with dr.suspend_grad():
-        bad, columns = call(draw)
-        dr.eval(bad, *columns.values())
-        wrong = dr.compress(bad)
-    index = wrong[0] if dr.width(wrong) else 0
-    first = {name: np.float32(np.array(x)[:, index]) for name, x in columns.items()}
-    law.check("million", dr.width(wrong), count=count, **first)
 
 
 def reason_of(problem: BaseException) -> str:

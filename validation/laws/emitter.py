@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import cached_property, partial
 
 import drjit as dr
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.linalg import norm
 
 from . import probe
-from .case import READS, READS_WHY, Case, Given, judge_many, reads_checked
+from .case import READS, READS_WHY, WAVE, Case, Given, reads_checked
 from .examine import TIMEOUT, examine
 from .faults import DEGREE, PLACE, larger, no_number, put
 from .law import (
@@ -227,8 +227,8 @@ class EmitterCase(Case):
         return _seen_from(mi.Point3f(*map(float, self.points[0])))
 
     def density(self, d: Array) -> Array:
-        """The density of directions. [N]"""
-        return self.seen(d)[0]
+        """The density of directions, 0 where it is not finite. [N]"""
+        return probe.finite_or_0(self.seen(d)[0])
 
     @cached_property
     def spread(self) -> tuple[Array, Array]:
@@ -411,29 +411,25 @@ def weights(law: Outcome, case: EmitterCase) -> None:
         law.check("seen", excess(value, light), where=met)
 
 
-@finds("million", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number)
+@finds("bad", "NaN for a share of the random numbers", 1e-6, quick=4e-6, weight=no_number)
 @measures(
     reads=most(READS, 0, READS_WHY),
     bad=number_of("samples that are not finite, or negative, or not of unit length", 0, SPOILS, SAMPLED),
     seen=number_of("values of eval(), where it is seen, that are not finite, or negative", 0, SPOILS),
-    million=most(
-        "samples of {count} from one point that are not finite, or negative, or whose direction is not of "
-        "length 1",
-        0,
-        SPOILS,
-    ),
 )
 def finite(law: Outcome, case: EmitterCase) -> None:
     """Samples are finite, directions have unit length, and weights and densities are not negative."""
     with reads_checked(law):
-        s = case.sample(case.points, extreme=0.4)
-        sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
-        length = abs(norm(np.float64(s.d), axis=1) - 1)
-        usable = (length <= LENGTH_TOL) & np.isfinite(s.dist) & (s.pdf >= 0)
-        law.check("bad", ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable), s, placed=case.placed)
+        one_point = np.broadcast_to(case.points[0], (WAVE, 3))
+        for s in (case.sample(case.points, extreme=0.4), *(case.sample(one_point) for _ in case.waves)):
+            sound = [np.isfinite(x) & (x >= 0) for x in (s.weight, s.value)]
+            length = abs(norm(np.float64(s.d), axis=1) - 1)
+            usable = (length <= LENGTH_TOL) & np.isfinite(s.dist) & (s.pdf >= 0)
+            bad = ~np.all(sound, axis=(0, 2)) | (s.lit & ~usable)
+            if bad.any() or not law.parts:
+                law.check("bad", bad, s, placed=case.placed)
         seen = _seen_anywhere(case)
         law.check("seen", ~(np.isfinite(seen) & (seen >= 0)).all(axis=1))
-        judge_many(law, case, partial(_at_random, case))
 
 
 def _seen_anywhere(case: EmitterCase) -> Array:
@@ -446,14 +442,6 @@ def _seen_anywhere(case: EmitterCase) -> Array:
     if case.around:
         return case.seen(case.units(case.count(2**16, 2**18)))[1]
     return np.zeros((1, 1))
-
-
-def _at_random(case: EmitterCase, draw: Callable[[], mi.Float]) -> tuple[mi.Mask, dict[str, mi.Point3f]]:
-    """Samples from one point, and which of them are not finite, or negative."""
-    it = case.from_first()
-    ds, weight = method(case.plugin, "sample_direction")(it, mi.Point2f(draw(), draw()))
-    weight = mi.unpolarized_spectrum(weight)
-    return probe.bad_samples(weight, ds.d, ds.pdf, ds.dist), {}
 
 
 LAWS = by_name(density, sampling, weights, finite)

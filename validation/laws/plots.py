@@ -42,7 +42,7 @@ def density(cells: Cells, seen: Array, angle: float, figure: Figure) -> None:
     place = np.stack([cells.below, r * side, turn * side]).astype(int)  # [3, C]
     shares = np.zeros((2, 2, side, side))
     np.add.at(shares[0], tuple(place), seen)
-    np.add.at(shares[1], tuple(place), cells.mean[:, 0])
+    np.add.at(shares[1], tuple(place), cells.mean)
     edges = np.linspace(0, 1, side + 1)
     shares /= 2 * np.pi / side * np.diff(edges**2)[:, None]
     azimuth = 2 * np.pi * edges - np.pi

@@ -209,25 +209,6 @@ class Probe:
         )
 
 
-def not_finite(*values: mi.Float | mi.Spectrum, least: float = -np.inf) -> mi.Mask:
-    """Where any of several numbers or colours is not finite, or below ``least``."""
-    bad = mi.Bool(False)
-    for value in values:
-        for component in [value] if dr.depth_v(value) == 1 else value:
-            bad |= ~(component >= least) | ~dr.isfinite(component)
-    return bad
-
-
-def bad_samples(weight: mi.Spectrum, d: mi.Vector3f, *numbers: mi.Float | mi.Spectrum) -> mi.Mask:
-    """Where samples spoil a picture: their weights are not finite, or negative.
-
-    Where weights are not 0, the same goes for ``numbers``, and directions must be of length 1.
-    """
-    not_unit = ~(dr.abs(dr.squared_norm(d) - 1) < 2e-3)
-    lit = dr.any(weight != 0)
-    return not_finite(weight, least=0) | (lit & (not_finite(*numbers, least=0) | not_unit))
-
-
 def lanes(call: Call, *columns: tuple[str, Array]) -> list[Array]:
     """Call ``call`` with columns [N] or [N, k] as Mitsuba types, in scalar variants once for each row.
 

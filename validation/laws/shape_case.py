@@ -152,7 +152,11 @@ class ShapeCase(Case):
     @cached_property
     def seen(self) -> Lanes:
         """Rays from all around to points in the box, and what they meet."""
-        o = self.around(self.count(2**14, 2**17))
+        return self.towards(self.count(2**14, 2**17))
+
+    def towards(self, count: int) -> Lanes:
+        """The hits of random rays from all around to points in the box."""
+        o = self.around(count)
         d = unit(self.middle + self.extent * self.rng.uniform(-0.55, 0.55, o.shape) - o)
         return trace(self.target, o, d)
 

@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import stats
 
 from .law import NO_LANES, Outcome, sidak
-from .probe import Array, Function, Lanes, finite_or_0, joined
+from .probe import Array, Function, Lanes, joined
 
 MAX_LEVEL = 17  # the finest cell is a hundred times what float32 rounding moves a direction by
 SIDE = 6
@@ -139,15 +138,15 @@ class Cells(Lanes):
         return np.bincount(self.find(codes), weights, minlength=len(self.start))
 
     def integrals(self, function: Function, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Integrals of ``function(directions [N, 3]) -> [N, K]`` over cells, and their variances. [C, K]"""
+        """Integrals of ``function(directions [N, 3]) -> [N]`` over cells, and their variances. [C], [C]"""
         wo, omega = self.points(rng)
-        values = function(wo.reshape(-1, 3)).reshape(*omega.shape, -1) * omega[..., None] * POINTS_PER_CELL
+        values = function(wo.reshape(-1, 3)).reshape(omega.shape) * omega * POINTS_PER_CELL
         return values.mean(axis=1), values.var(axis=1) / (POINTS_PER_CELL - 1)
 
     def expected(self, density: Function, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """Expected number of ``count`` samples in each cell, and its variance. [C], [C]"""
         share, variance = self.integrals(density, rng)
-        return count * share[:, 0], count**2 * variance[:, 0]
+        return count * share, count**2 * variance
 
     def rows(self) -> Iterator[Array]:
         """For each cell [C] the number of its row: of one r or azimuth, or in slices along x and y."""
@@ -168,7 +167,6 @@ def hold_small(law: Outcome, cells: Cells, counts: Array, known: float, at: Lane
     ``counts`` [3, C]: samples seen, samples expected, and the variance of the latter. ``known``: the relative
     error to which densities are known.
     """
-    counts = np.where(np.isfinite(counts[1]), counts, 0)  # where they are not, the law ``finite`` says so
     chances = chances_of(counts, known)
     cell = cells.bounds(int(chances.argmin()))
     law.check("small", p_value_of_least(chances, len(chances)), at, cell=cell)
@@ -197,37 +195,24 @@ def in_order(parts: Sequence[Cells]) -> Cells:
 
 
 def integrate(
-    function: Function,
-    cells: Cells,
-    rng: np.random.Generator,
-    codes: Array,
-    samples: int,
-    weights: ArrayLike = 1.0,
+    function: Function, cells: Cells, rng: np.random.Generator, codes: Array, samples: int
 ) -> Cells:
-    """Integrate ``function(directions [N, 3]) -> [N, K]`` over cells; those known too badly are cut further.
+    """Integrate ``function(directions [N, 3]) -> [N]`` over cells; those known too badly are cut further.
 
-    ``codes`` and ``weights`` of ``samples`` samples say what the first integrand gives where; the integrals
-    are made as certain as so many samples would be. The cells returned have the ``mean`` of each estimate and
-    its ``variance``, both [C, K].
+    ``codes`` of ``samples`` samples say where how much is expected; the integrals are made as certain as so
+    many samples would be. The cells returned have the ``mean`` of each estimate and its ``variance``. [C]
     """
-
-    def finite(wo: Array) -> Array:
-        return finite_or_0(function(wo))
-
     done = []
-    order = np.argsort(codes)
-    codes = codes[order]
-    sums = np.cumsum(np.broadcast_to(weights, codes.shape)[order])
-    below = np.concatenate([[0], sums]) / samples
+    codes = np.sort(codes)
     for attempt in range(MAX_REFINEMENTS):
-        first, last = below[np.searchsorted(codes, [cells.start, cells.end])]
-        by_samples = last - first
-        mean, variance = cells.integrals(finite, rng)
-        total = abs(mean).sum(axis=0) + 1e-12
+        first, last = np.searchsorted(codes, [cells.start, cells.end])
+        seen = last - first
+        mean, variance = cells.integrals(function, rng)
+        total = mean.sum() + 1e-12
         # half of what chance does to the count of the samples, or one sample, is known well enough
-        enough = 0.25 * abs(mean) / total / samples + 1 / samples**2
-        bad = (variance / total**2 > enough).any(axis=1)
-        bad |= (by_samples * samples > 1.5) & (mean[:, 0] < 0.2 * by_samples)
+        enough = 0.25 * mean / total / samples + 1 / samples**2
+        bad = variance / total**2 > enough
+        bad |= (seen > 1) & (mean < 0.2 * seen / samples)
         bad &= (cells.level < MAX_LEVEL) & (attempt < MAX_REFINEMENTS - 1)
         done.append(cells.having(mean=mean, variance=variance)[~bad])
         if not bad.any():
@@ -246,8 +231,8 @@ def chi_square(
     and z of a 16th. The second is the cell that is most off. ``known``: to how much the density is known,
     relative.
     """
-    expected = count * integrals.mean[:, 0]
-    counts = np.array([integrals.counts(codes), expected, count**2 * integrals.variance[:, 0]])
+    expected = count * integrals.mean
+    counts = np.array([integrals.counts(codes), expected, count**2 * integrals.variance])
     neighbours = np.arange(len(expected))
     ways = [(count / 25, neighbours), (128, neighbours), (16, neighbours)]
     ways += [(16, np.argsort(axis)) for axis in integrals.middle.T]
