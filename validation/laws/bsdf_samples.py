@@ -175,7 +175,8 @@ def sampling(law: Outcome, case: BsdfCase) -> None:
         _in_small_cells(law, case, broad)
     if not law.holds:
         angle = float(np.degrees(np.arccos(at.wi[i, 2])))
-        law.plot = partial(plots.density, *shown[i], angle)
+        cells, seen = shown[i]
+        law.plot = partial(plots.density, cells, seen, angle)
     if len(judged) < len(case.views):
         law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(judged)} angles, which are left out")
 
