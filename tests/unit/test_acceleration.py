@@ -20,7 +20,7 @@ from mrt_mitsuba.plugins.whitted.shapes import Spheres
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-PLACES = [(0.1, 0.2, 0.3), (0, 0, 0), (1.02, 1.02, 1.02), (5, 0, 0), (-40, 3, 2), (0, -2000, 0)]
+PLACES = [(0.1, 0.2, 0.3), (0, 0, 0), (1.02, 1.02, 1.02), (5, 0, 0), (-40, 3, 2), (0, -20_000, 0)]
 
 
 def crowd(size: float, shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -86,14 +86,15 @@ def test_lists_around_the_eye_find_what_a_search_finds(kind, size):
             assert np.mean(seen) == at_eye
 
 
-def test_trees_find_hairs_far_from_the_origin():
-    """Hairs along an axis, thinner than the steps of coordinates there; their own test meets nearly all."""
+@pytest.mark.parametrize(("place", "away"), [(300, 1), (0, 300)])
+def test_trees_find_hairs_thinner_than_the_steps_of_coordinates(place, away):
+    """Hairs along an axis, far from the origin or from where rays start; their own test meets nearly all."""
     rng = np.random.default_rng(5)
-    starts = np.float32(rng.uniform(299, 301, (64, 3)))
+    starts = np.float32(place + rng.uniform(-1, 1, (64, 3)))
     ends = starts + np.float32([0, 0, 1])
     hairs = group(np.column_stack([starts, ends, np.full(64, 1e-5)]), kind="cylinder")
     things = Quadrics([mi.load_dict(hairs)])
-    origins = np.float32(starts + rng.normal(size=(64, 3)))
+    origins = np.float32(starts + away * rng.normal(size=(64, 3)))
     d = starts + np.array([0, 0, 0.5]) - origins  # to their middles
     ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(d.T), 2, 0, [])
     alone = np.array(things.block(mi.UInt32(things.leaf_of), ray))

@@ -17,9 +17,10 @@ from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.adaptive import rounds
+from mrt_mitsuba.adaptive.denoise import Denoiser
 from mrt_mitsuba.adaptive.estimate import Sums, forecast, pixel_variance
 from mrt_mitsuba.adaptive.rounds import Tracer, run_rounds
-from mrt_mitsuba.adaptive.tails import PARETO_K_THRESHOLD
+from mrt_mitsuba.adaptive.tails import PARETO_K_THRESHOLD, tail_shape
 from mrt_mitsuba.adaptive.target import Goal, Target
 from mrt_mitsuba.rendering.film import Film
 
@@ -250,6 +251,30 @@ def test_a_target_takes_rays_enough_to_show_what_is_rare():
     """512 rays a pixel in a small picture, where the first round reaches the target."""
     result = _render(Draws(_calm), target=1e12, rays=5000)
     assert result.rounds[-1].spp == pytest.approx(512, rel=0.15)
+
+
+def test_a_target_is_reached_in_few_rounds():
+    """6.3 in the mean: each is as large as is foreseen to be enough, up to the growth that is allowed."""
+    assert np.mean([len(_render(Draws(_calm), seed, 0.02, 9000).rounds) for seed in range(10)]) < 7.3
+
+
+def test_a_tail_of_few_values_is_pulled_to_a_shape_of_a_half():
+    """Of 20 values above the others, by ten more: so few of them seldom tell a heavy tail."""
+    values = np.linspace(1, 0.005, 100) ** -0.1  # of a Pareto law of shape 0.1, without chance
+    assert tail_shape(values, np.ones(100)) == pytest.approx((20 * 0.1 + 10 * 0.5) / 30, abs=0.05)
+
+
+def test_errors_of_a_mixture_have_the_curvature_of_the_metric():
+    """Which is a factor of squares."""
+    found = []
+    for curvature in (1.0, 4.0):
+        tracer = Tracer(Draws(_calm), seed=0)  # type: ignore[arg-type]
+        stats = tracer.trace(tracer.blank("display"), 4 * tracer.initial_allocation, lambda rays: None)
+        vars(stats)["curvature"] = curvature
+        plain = np.zeros((SIDE, SIDE, 3), np.float32)
+        mixture = Denoiser(lambda: (plain, plain)).mixture(stats, plain_error=1.0)  # noqa: B023
+        found.append([mixture.rmse, mixture.low, mixture.high, mixture.error.mean()])
+    np.testing.assert_allclose(found[1], 2 * np.array(found[0]), rtol=1e-6)
 
 
 def test_no_more_rays_than_allowed_are_spent_where_scouts_met_less_noise():
