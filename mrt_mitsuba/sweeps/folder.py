@@ -1,7 +1,4 @@
-"""The folder of a sweep, in which one sweep works at a time.
-
-The system frees the lock when the process ends, however it ends, and also on network file systems.
-"""
+"""The folder of a sweep, in which one sweep works at a time, and which of its pictures are up to date."""
 
 from __future__ import annotations
 
@@ -10,9 +7,14 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from mrt_mitsuba.errors import OutputError
-from mrt_mitsuba.files.replacing import TEMPORARY
+import OpenEXR
 
+from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.files.images import silenced
+from mrt_mitsuba.files.replacing import TEMPORARY
+from mrt_mitsuba.sweeps.jobs import Job
+
+MADE_WITH = "mrt:sweep"  # in the header of each picture: its job's ``made_with``
 LOCK = ".mrt-sweep.lock"
 
 
@@ -20,6 +22,7 @@ LOCK = ".mrt-sweep.lock"
 def reserved(folder: str) -> Iterator[None]:
     """Keep other sweeps out of a folder within the block, by a lock on a file in it.
 
+    The system frees it when the process ends, however it ends, and also on network file systems.
     Raises ``OutputError`` if another process has the lock, or nothing can be written.
     """
     import fcntl
@@ -40,3 +43,31 @@ def reserved(folder: str) -> Iterator[None]:
             Path(path).unlink(missing_ok=True)
             for left in Path(folder).glob(TEMPORARY.format("*")):  # by workers that were killed
                 left.unlink(missing_ok=True)
+
+
+def is_fresh(job: Job, folder: str, recorded: bool) -> bool:
+    """True if a job's picture is whole and was made by the same scene, settings and versions.
+
+    ``recorded``: the folder's table has the picture. Raises ``OutputError`` for a file of the user's own
+    under its name: a picture that no sweep made, or something unreadable that the table does not have.
+    """
+    path = os.path.join(folder, job.file)
+    if not os.path.lexists(path):
+        return False
+    found = _fingerprint_in(path)
+    if found == "" or (found is None and not (recorded and os.path.isfile(path))):
+        raise OutputError(
+            f"{path} was not made by a sweep, which would replace it: move it away, or choose another folder"
+        )
+    return found == job.made_with
+
+
+def _fingerprint_in(path: str) -> str | None:
+    """Return the ``made_with`` in a picture that a sweep made: "" in any other, None in a damaged file."""
+    if not os.path.isfile(path):  # a pipe has no end to wait for
+        return None
+    try:
+        with silenced():
+            return str(OpenEXR.File(path).header().get(MADE_WITH, ""))
+    except Exception:  # whatever the library raises for damaged files
+        return None

@@ -19,7 +19,6 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import Values
 from mrt_mitsuba.rendering.api import open_with
 from mrt_mitsuba.rendering.settings import RenderSettings
@@ -179,7 +178,7 @@ def check_parameters(jobs: Sequence[Job]) -> None:
         which = fingerprint(job.scene, names)
         if params and which not in opened:
             opened.add(which)
-            open_with(job.scene, RenderSettings.of(**job.arguments), Budget.of(None))
+            open_with(job.scene, RenderSettings.of(**job.arguments))
 
 
 # ------------------------------------------- On the way to workers ---------------------------------------

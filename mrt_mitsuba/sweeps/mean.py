@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.adaptive.error import ErrorEstimate
 from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS
-from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.rendering.api import Result, open_with
 from mrt_mitsuba.rendering.plan import make_plan
 from mrt_mitsuba.rendering.progress import Timings
@@ -26,40 +26,33 @@ BLOCK = 8  # pixels along the side of a block whose noise is taken as independen
 
 def mean_of_seeds(folder: str, job: Job, rows: Sequence[Facts]) -> Result:
     """Return the mean of the pictures in ``rows``; ``job``: one of theirs, for the plan and the camera."""
-    total: np.ndarray | None = None
-    square = np.zeros(())
-    layers: dict[str, np.ndarray] = {}
-    for row in rows:
+    # By B. P. Welford's updates (Technometrics 4, 1962), in which no digits cancel
+    mean = squares = np.zeros(())
+    layers: dict[str, Any] = {}
+    for number, row in enumerate(rows, 1):
         picture = read_exr(os.path.join(folder, row["file"]))
-        if total is None:
-            first = picture.image.astype(np.float64)
-            total = np.zeros_like(first)
-            square = np.zeros_like(first)
-            layers = {name: np.zeros_like(values) for name, values in picture.layers.items()}
-        shifted = picture.image - first  # around the first: no digits cancel
-        total += shifted
-        square += shifted * shifted
+        deviation = picture.image - mean
+        mean = mean + deviation / number
+        squares = squares + deviation * (picture.image - mean)
         for name, values in picture.layers.items():
             source = getattr(LAYERS.get(name.split(".")[0]), "source", "")
             if name == "samples.Y":
-                layers[name] += values
+                layers[name] = layers.get(name, 0) + values
             elif source in (FIRST_HIT, DERIVED):
                 layers[name] = values
             else:
-                layers[name] += values / np.float32(len(rows))
-    assert total is not None
-    count = len(rows)
-    variance = np.maximum(square - total * total / count, 0) / (count - 1) / count  # of the mean
+                layers[name] = layers.get(name, 0) + values / np.float32(len(rows))
+    variance = squares / (len(rows) - 1) / len(rows)  # of the mean
     layers.pop("variance", None)
     layers["error.Y"] = np.sqrt(variance.mean(-1)).astype(np.float32)
     settings = RenderSettings.of(**job.arguments)
     with runtime.render_lock, runtime.within(settings.variant or runtime.use()):
-        source = open_with(job.scene, settings, Budget.of(None))
+        source = open_with(job.scene, settings)
         with sized(source):
             plan = make_plan(source, Shader(source, settings.motion), settings)
             camera = camera_matrices(source.sensor)
     return Result(
-        image=(first + total / count).astype(np.float32),
+        image=mean.astype(np.float32),
         layers=layers,
         plan=plan,
         timings=Timings(total=sum(row["seconds"] or 0.0 for row in rows)),

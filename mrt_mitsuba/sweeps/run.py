@@ -12,9 +12,8 @@ from mrt_mitsuba.errors import UsageError, needs_extra
 from mrt_mitsuba.files.replacing import make_folder
 from mrt_mitsuba.options import StrPath, Values, check, integer
 from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-from mrt_mitsuba.sweeps.folder import reserved
+from mrt_mitsuba.sweeps.folder import is_fresh, reserved
 from mrt_mitsuba.sweeps.jobs import check_parameters, jobs, points
-from mrt_mitsuba.sweeps.pictures import is_fresh
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.worker import describe
 

@@ -8,16 +8,17 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 
+import drjit as dr
+
 from mrt_mitsuba import runtime, user_plugins
 from mrt_mitsuba.errors import MrtError
 from mrt_mitsuba.files.images import save
-from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.machine import affinity, memory, usable_cores
 from mrt_mitsuba.options import SMALLEST_MEMORY
+from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.sweeps.folder import LOCK
+from mrt_mitsuba.sweeps.folder import LOCK, MADE_WITH
 from mrt_mitsuba.sweeps.jobs import Facts, Job, decode, scene_digest
-from mrt_mitsuba.sweeps.pictures import MADE_WITH
 
 
 def describe(folder: str) -> Facts:
@@ -58,20 +59,16 @@ def render_job(
                 os.chdir(working_folder)
             user_plugins.load(plugins)
             threads = max(2, usable_cores() // sharing.get(here["cores"], 1))
-            facts |= _render(decode(data), folder, threads, worker.memory_manager.memory_limit)
+            if dr.thread_count() != threads:
+                dr.set_thread_count(threads)
+            facts |= _render(decode(data), folder, worker.memory_manager.memory_limit)
     except MrtError as error:
         facts["error"] = str(error)
     return facts
 
 
-def _render(job: Job, folder: str, threads: int, limit: int | None) -> Facts:
+def _render(job: Job, folder: str, limit: int | None) -> Facts:
     start = time.perf_counter()
-    import drjit as dr
-
-    from mrt_mitsuba.rendering.api import render
-
-    if dr.thread_count() != threads:
-        dr.set_thread_count(threads)
     arguments = dict(job.arguments)
     runtime.use(arguments.get("variant") or runtime.default_variant())  # whatever an earlier sweep used
     if limit:  # other workers need theirs
@@ -79,10 +76,9 @@ def _render(job: Job, folder: str, threads: int, limit: int | None) -> Facts:
     result = render(job.scene, progress=Progress(), **arguments)
     if scene_digest(job.scene) != job.scene_digest:
         raise MrtError(f"{job.scene} has changed since the sweep began: run it again")
-    header = result.header() | {MADE_WITH: job.made_with}
     path = os.path.join(folder, job.file)
-    check_target(path, result.inputs)  # a scene may read pictures of earlier sweeps
-    save(path, result.image, layers=result.layers, header=header)
+    header = result.header() | {MADE_WITH: job.made_with}
+    save(path, result.image, layers=result.layers, header=header, inputs=result.inputs)
     return {
         "file": job.file,
         "seconds": time.perf_counter() - start,
