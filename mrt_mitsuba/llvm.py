@@ -58,20 +58,23 @@ def choose(environ: Mapping[str, str], search_path: Iterable[str], system: Itera
     """
     wheel = wheel_library(search_path)
     named = environ.get(VARIABLE, "")
+    if named in (BLOCKED, wheel):
+        named = ""  # not the user's choice
+    newest = max(_matching(system, "libLLVM"), key=lambda path: version_of(path) or (), default="")
+    places = (
+        (named, f"named by {VARIABLE}"),
+        (wheel, f"from the package {WHEEL}"),
+        (newest, "of the system"),
+    )
+    found = [(path, version_of(path), source) for path, source in places]
+    usable = [each for each in found if each[1] and each[1][0] >= OLDEST]
+    path, version, source = usable[0] if usable else (None, None, "none")
     refused = ""
-    if named not in ("", BLOCKED, wheel):
-        version = version_of(named)
-        if version and version[0] >= OLDEST:
-            return Choice(named, version, f"named by {VARIABLE}", "")
+    if named and path != named:
         refused = (
             f"{named}, named by {VARIABLE}, is no file of LLVM {OLDEST} or newer, such as libLLVM.so.19.1"
         )
-    newest = max(_matching(system, "libLLVM"), key=lambda path: version_of(path) or (), default="")
-    for path, source in ((wheel, f"from the package {WHEEL}"), (newest, "of the system")):
-        version = version_of(path)
-        if version and version[0] >= OLDEST:
-            return Choice(path, version, source, refused)
-    return Choice(None, None, "none", refused)
+    return Choice(path, version, source, refused)
 
 
 def wheel_library(search_path: Iterable[str]) -> str:

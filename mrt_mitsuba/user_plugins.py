@@ -32,11 +32,9 @@ def plugin_names(plugins: Any) -> list[str]:
 
     Raises ``UsageError`` for a file that is not there or anything that is neither.
     """
-    given = [plugins] if isinstance(plugins, str | os.PathLike) else plugins
-    if not isinstance(given, Iterable) or isinstance(given, bytes):
-        raise UsageError(f"plugins={plugins!r}: give a file such as ./mine.py, or the name of a module")
+    one = isinstance(plugins, str | bytes | os.PathLike) or not isinstance(plugins, Iterable)
     names = []
-    for each in given or ():
+    for each in [plugins] if one else plugins:
         if not isinstance(each, str | os.PathLike):
             raise UsageError(f"plugins={each!r}: give a file such as ./mine.py, or the name of a module")
         text = os.fspath(each)
