@@ -68,7 +68,7 @@ class Passes:
                 self._run_rounds(step, exposer)
             elif exposer.film is None:
                 self._trace(step, exposer)
-            elif self._plan.whole:
+            elif self._shader.whole:
                 self._expose_whole(step, exposer)
             else:
                 exposed = self._expose(step, exposer, exposed)
@@ -128,15 +128,14 @@ class Passes:
 
     def _expose_whole(self, step: Pass, exposer: Exposer) -> None:
         """Expose the film by an integrator that renders whole pictures only."""
-        from mrt_mitsuba.rendering.whole import whole_pictures
+        from mrt_mitsuba.rendering.whole import whole_picture
 
         film = exposer.film
         rays = film.rays_near(step.pattern.size)
         with self._job.stage(step.name, rays * film.pixels) as advance:
-            parts = whole_pictures(exposer, self._seed_of(step), rays, advance)
-            counts, pictures = zip(*parts, strict=True)
-        self._count(sum(counts), ...)
-        self._develop(exposer, np.average(pictures, axis=0, weights=counts))
+            count, picture = whole_picture(exposer, self._seed_of(step), rays, advance)
+        self._count(count, ...)
+        self._develop(exposer, picture)
 
     def _run_rounds(self, step: Rounds, exposer: Exposer) -> None:
         """Sample adaptively until the goal is reached."""

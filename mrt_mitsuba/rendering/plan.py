@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -156,14 +155,16 @@ class Blur(Pass):
 # ----------------------------------------- The plan -------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Plan:
-    """Plan of a render: the facts known before it, and every decision made from them."""
+    """Plan of a render: the facts known before it, and every decision made from them.
+
+    Notebooks and ``print`` show it as text.
+    """
 
     scene: str  #: its number or name
     variant: str  #: of Mitsuba
     integrator: str  #: name of its plugin
-    whole: bool  #: whether it renders whole pictures only, instead of tracing given rays
     width: int  #: pixels
     height: int  #: pixels
     film: str  #: filter and pixel format, where a film is exposed by its own rules rather than a lattice
@@ -190,7 +191,7 @@ class Plan:
         further = () if left_out is None else (left_out,)
         return replace(self, passes=tuple(steps), left_out=(*self.left_out, *further))
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]
         if self.time_strata:
             moments = "each ray at its own moment" if self.film else f"{self.time_strata} frames"
@@ -206,13 +207,6 @@ class Plan:
             lines += [f"  without {', '.join(what for what, _ in group)}: {why}"]
         return "\n".join(lines)
 
-    def __repr__(self) -> str:
-        passes = ", ".join(step.name for step in self.passes)
-        return f"<Plan for {self.scene}: {self.width}x{self.height}, {self.integrator}, passes {passes}>"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(str(self))}</pre>"
-
 
 def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
     """Decide what to trace and what to leave out.
@@ -225,8 +219,13 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
     film = shader.film
     on_film = decided.lattice == FILM
     asked, possible = _layers(decided, goal, shader)
-    traced = _traced(asked & shader.layers, decided, shader)
-    passes = tuple(_passes(traced, decided, goal, shader))
+    refining = decided.aa != 1 or "edges" in asked
+    detector = decided.aamode if decided.aamode in DETECTORS and refining else None
+    strata = decided.motionsamples if decided.motion else 0
+    # a filter works on the picture of each moment, a film's rays have moments of their own
+    frames = strata if strata and not on_film and (detector or decided.focaldist) else 1
+    traced = _traced(asked, decided, detector, shader)
+    passes = tuple(_passes(traced, decided, detector, strata if frames == 1 else 1, goal, shader))
     returned = asked.union(*(step.gives & possible for step in passes))
     channels = sum(len(TABLE[name].letters) for name in traced | returned)
     if on_film:  # sums by pixel, in double precision, while a film is exposed
@@ -236,7 +235,6 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
         scene=source.name,
         variant=str(mi.variant()),
         integrator=shader.name,
-        whole=shader.whole,
         width=source.width,
         height=source.height,
         film=f"{film.rfilter.class_name()}, {film.pixel_format or 'spectral bands'}" if on_film else "",
@@ -244,8 +242,8 @@ def make_plan(source: Source, shader: Shader, settings: RenderSettings) -> Plan:
         kernel=shader.kernel,
         facts=shader.facts,
         channels=channels,
-        time_strata=_strata(decided),
-        frames=_frames(decided),
+        time_strata=strata,
+        frames=frames,
         seed=decided.seed,
         layers=returned,
         passes=passes,
@@ -286,25 +284,6 @@ def _decided(settings: RenderSettings, goal: Goal | None, source: Source, shader
     )
 
 
-def _detector(settings: RenderSettings) -> str | None:
-    """Return the edge detector that runs, a key of ``DETECTORS``, if any."""
-    refining = settings.aa != 1 or "edges" in settings.layers
-    return settings.aamode if settings.aamode in DETECTORS and refining else None
-
-
-def _strata(settings: RenderSettings) -> int:
-    """Return into how many parts the time is divided; 0 where the camera stands still."""
-    return settings.motionsamples if settings.motion else 0
-
-
-def _frames(settings: RenderSettings) -> int:
-    """Return how many pictures are rendered, filtered and averaged."""
-    filtered = _detector(settings) or settings.focaldist
-    if settings.motion and settings.lattice != FILM and filtered:
-        return settings.motionsamples
-    return 1
-
-
 def _in_force(
     settings: RenderSettings, goal: Goal | None, source: Source, shader: Shader, returned: frozenset[str]
 ) -> dict[str, Any]:
@@ -324,11 +303,12 @@ def _in_force(
     return {name: values[name] for name in _NAMED if values[name] is not None}
 
 
-def _traced(asked: frozenset[str], settings: RenderSettings, shader: Shader) -> frozenset[str]:
+def _traced(
+    asked: frozenset[str], settings: RenderSettings, detector: str | None, shader: Shader
+) -> frozenset[str]:
     """Return the layers to trace: the picture, those that passes over it read, and those asked for."""
-    detector = _detector(settings)
     read = DETECTORS[detector] if detector else ()
-    traced = {"image", *asked, *read}
+    traced = {"image", *(asked & shader.layers), *read}
     if settings.focaldist:
         traced.add("depth")
     if settings.spp != 1 and "image" in read:
@@ -413,50 +393,44 @@ def _layers(
 
 
 def _passes(
-    traced: frozenset[str], settings: RenderSettings, goal: Goal | None, shader: Shader
+    traced: frozenset[str],
+    settings: RenderSettings,
+    detector: str | None,
+    strata: int,
+    goal: Goal | None,
+    shader: Shader,
 ) -> Iterator[Pass]:
-    """Yield the passes over the picture, in their order."""
+    """Yield the passes over the picture, in their order; ``strata``: of the time that one frame sees."""
     on_film = settings.lattice == FILM
-    detector = _detector(settings)
-    all_samples = _samples(settings)
+    aa = settings.aa or AA
+    repeats = (settings.spp or 1) * max(strata, 1)
+    if on_film:  # each ray has a time of its own
+        every = SamplePattern(FILM, aa, count=aa**2, repeats=repeats)
+        centre = replace(every, count=1)
+    else:
+        centre = SamplePattern(repeats=repeats, time_strata=strata)
+        every = replace(centre, lattice=str(settings.lattice), aa=aa, count=aa**2)
     at_centre = frozenset(name for name in traced if TABLE[name].source == FIRST_HIT)
-    if at_centre and (on_film or (detector is None and not all_samples.holds_centre)):
+    if at_centre and (on_film or (detector is None and not every.holds_centre)):
         # layers of the first hit belong to the pixel's centre
-        yield FirstHits(layers=at_centre, pattern=SamplePattern(time_strata=min(_strata(settings), 1)))
+        yield FirstHits(layers=at_centre, pattern=SamplePattern(time_strata=min(strata, 1)))
         traced -= at_centre
     if goal:
         yield Rounds(layers=traced, pattern=SamplePattern(FILM), goal=goal)
     elif detector is None:
-        yield Exposure(layers=traced, pattern=all_samples)
+        yield Exposure(layers=traced, pattern=every)
     else:
         # a detector must see no noise: it looks at the centre of each pixel
-        pattern = replace(all_samples, count=1) if on_film else _centre(settings)
-        noisy = shader.random and pattern.repeats == 1 and "image" in DETECTORS[detector]
-        yield Exposure(layers=traced, pattern=pattern)
+        noisy = shader.random and centre.repeats == 1 and "image" in DETECTORS[detector]
+        yield Exposure(layers=traced, pattern=centre)
         yield Edges(detector=detector, noisy=noisy)
         if settings.aa != 1:
-            first = 1 if on_film or all_samples.holds_centre else 0  # the centre is not traced again
-            yield Refinement(layers=traced - at_centre - {"square"}, pattern=_samples(settings, first))
+            first = 1 if on_film or every.holds_centre else 0  # the centre is not traced again
+            further = replace(every, first=first, count=aa**2 - first)
+            yield Refinement(layers=traced - at_centre - {"square"}, pattern=further)
     if settings.focaldist and settings.focalrange is not None:
         focus: dict[str, Any] = {"focal_distance": settings.focaldist, "focal_range": settings.focalrange}
         yield Blur(mode=settings.dof, **focus)
-
-
-def _samples(settings: RenderSettings, first: int = 0) -> SamplePattern:
-    """Return the samples of a pixel from number ``first`` on."""
-    aa = settings.aa or AA
-    repeats = settings.spp or 1
-    if settings.lattice == FILM:
-        repeats *= max(_strata(settings), 1)  # each ray has a time of its own
-        return SamplePattern(FILM, aa, first, aa**2 - first, repeats)
-    pattern = _centre(settings)
-    return replace(pattern, lattice=str(settings.lattice), aa=aa, first=first, count=aa**2 - first)
-
-
-def _centre(settings: RenderSettings) -> SamplePattern:
-    """Return the pixel's centre alone, at the same times in every pixel."""
-    strata = _strata(settings) if _frames(settings) == 1 else 1
-    return SamplePattern(repeats=(settings.spp or 1) * max(strata, 1), time_strata=strata)
 
 
 def _left_out(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.interrupts import deliver_pending
-from mrt_mitsuba.machine import Budget, Workspace
+from mrt_mitsuba.machine import Workspace
 
 if TYPE_CHECKING:
     from mrt_mitsuba.adaptive.error import RoundPicture
@@ -42,6 +42,7 @@ class Progress:
         yield _ignore
 
 
+@dataclass(kw_only=True)
 class TerminalProgress(Progress):
     """Print messages, and a bar on standard error if that is a terminal, or in a notebook.
 
@@ -49,18 +50,10 @@ class TerminalProgress(Progress):
     stages that take longer than ``delay`` seconds.
     """
 
-    def __init__(
-        self,
-        *,
-        show_plan: bool = False,
-        messages: bool = True,
-        delay: float = 0.0,
-        unit: str = "px",
-    ) -> None:
-        self.show_plan = show_plan
-        self.messages = messages
-        self.delay = delay
-        self.unit = unit
+    show_plan: bool = False
+    messages: bool = True
+    delay: float = 0.0
+    unit: str = "px"
 
     def plan(self, plan: object) -> None:
         if self.show_plan:
@@ -106,11 +99,6 @@ class Timings:
     kernels: float = 0.0  #: kernels running
     passes: dict[str, float] = field(default_factory=dict)  #: by the name of the pass
 
-    def __repr__(self) -> str:
-        parts = {"load": self.load, **self.passes, "of these: compile": self.compile, "kernels": self.kernels}
-        named = ", ".join(f"{name} {seconds:.3g}" for name, seconds in parts.items())
-        return f"<Timings: {self.total:.3g} s: {named}>"
-
 
 class Job:
     """A render under way: where it reports, how much it does at once, and what it has cost so far."""
@@ -118,7 +106,7 @@ class Job:
     workspace: Workspace  #: memory for rays and filters, known once there is a plan
 
     def __init__(
-        self, progress: Progress, budget: Budget, on_round: Callable[[RoundPicture], object] | None
+        self, progress: Progress, budget: int, on_round: Callable[[RoundPicture], object] | None
     ) -> None:
         self.progress = progress
         self.budget = budget  #: bytes that it may use

@@ -214,20 +214,17 @@ def camera_matrices(sensor: mi.Sensor) -> dict[str, np.ndarray]:
     to_world = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
     if not np.isfinite(to_world).all() or np.linalg.matrix_rank(to_world) < 4:
         return {}
+    from_world = np.linalg.inv(to_world)
     # Mitsuba's cameras look along +z, with x to the left
-    matrices = {"worldToCamera": np.diag([-1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(to_world)}
+    matrices = {"worldToCamera": np.diag([-1.0, 1.0, -1.0, 1.0]) @ from_world}
     numbers = mi.traverse(sensor)
-    film = sensor.film()
-    names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
-    fov, *shift = (np.array(numbers.get(name, 0.0)).item() for name in names)
-    if fov:
-        size = np.array(film.size(), float)
-        crop = np.array(film.crop_size(), float)
-        offset = np.array(film.crop_offset(), float)
-        x, y = size[0] / (2 * np.tan(np.deg2rad(fov) / 2)) / crop  # widths and heights at a distance of one
-        centre_x, centre_y = ((0.5 - np.array(shift)) * size - offset) / crop
-        projection = np.array([[x, 0, -centre_x, 0], [0, -y, -centre_y, 0], [0, 0, 1, 0], [0, 0, -1, 0]])
-        matrices["worldToNDC"] = projection @ matrices["worldToCamera"]
+    if "x_fov" in numbers:
+        film = sensor.film()
+        names = ("principal_point_offset_x", "principal_point_offset_y")
+        shift = [np.array(numbers.get(name, 0.0)).item() for name in names]  # which Mitsuba leaves out
+        projection = np.array(sensor.projection_transform().matrix, np.float64).reshape(4, 4)
+        projection[:2, 2] -= np.multiply(shift, film.size()) / film.crop_size()
+        matrices["worldToNDC"] = projection @ from_world
     return {name: matrix.T for name, matrix in matrices.items()}
 
 

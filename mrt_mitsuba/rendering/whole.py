@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -14,12 +14,10 @@ from mrt_mitsuba.rendering.progress import Advance
 from mrt_mitsuba.rendering.seeds import derived_seed
 
 
-def whole_pictures(
-    exposer: Exposer, seed: int, rays: int, advance: Advance
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield (spp, picture [H, W, channels]) of passes that fit into memory, with about ``rays`` spp in all.
+def whole_picture(exposer: Exposer, seed: int, rays: int, advance: Advance) -> tuple[int, np.ndarray]:
+    """Return the spp traced, about ``rays``, and the picture [H, W, channels].
 
-    The spp of a pass are as the scene's sampler rounds them.
+    It is the mean of parts that fit into memory, with the spp that the scene's sampler allows.
     """
     job = exposer.job
     film = exposer.film
@@ -29,6 +27,8 @@ def whole_pictures(
             f"the integrator {shader.name} gives whole pictures, which this film keeps as "
             f"{', '.join(film.bands)}: use an hdrfilm"
         )
+    total: Any = 0
+    traced = 0
     most = max(1, job.workspace.wavefront_size(len(exposer.names)) // film.pixels)
     for done in range(0, rays, most):
         count = film.rays_near(min(most, rays - done))
@@ -45,6 +45,8 @@ def whole_pictures(
         found = np.delete(raw, place, -1) / np.where(weight == 0, 1, weight)[..., None]
         if film.grey:
             found[..., :3] = (found[..., :3] @ LUMINANCE)[..., None]
-        yield count, found
+        total = total + count * found
+        traced += count
         advance(count * film.pixels)
         job.rays["primary"] += count * film.pixels
+    return traced, total / traced
