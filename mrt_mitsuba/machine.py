@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from mrt_mitsuba.errors import UsageError
@@ -31,18 +31,10 @@ MIN_BAND_ROWS = 24  # with fewer, most of the work is done twice
 GROUP = Path("/sys/fs/cgroup")  # the control group (version 2) of a container, as it sees it
 
 
-@dataclass
-class Budget:
-    """Bytes that a render may use."""
-
-    size: int
-    inputs: set[str] = field(default_factory=set)  #: paths of the files that the scene is read from
-
-    @classmethod
-    def of(cls, wanted: int | None) -> Budget:
-        """The bytes asked for, by default half of those that are free; never more than the machine has."""
-        free, most = memory()
-        return cls(min(free // 2 if wanted is None else wanted, most))
+def budget(wanted: int | None) -> int:
+    """Return the bytes asked for, by default half of those that are free; never more than the machine has."""
+    free, most = memory()
+    return min(free // 2 if wanted is None else wanted, most)
 
 
 @dataclass(frozen=True)
@@ -58,11 +50,11 @@ class Workspace:
         height: int,
         channels: int,
         *,
-        budget: Budget,
+        budget: int,
         pictures: int = 1,
         rays_per_pixel: int = 1,
     ) -> Workspace:
-        """Return what a budget leaves next to ``pictures`` pictures of ``channels`` float32 channels.
+        """Return what a budget (bytes) leaves next to ``pictures`` pictures of ``channels`` float32 channels.
 
         ``rays_per_pixel``: traced at once. Raises ``UsageError`` if the budget does not suffice.
         """
@@ -72,13 +64,13 @@ class Workspace:
             max(min(MIN_WAVEFRONT, pixels), rays_per_pixel) * channels * BYTES_PER_CHANNEL_OF_RAY,
             min(MIN_BAND_ROWS, height) * width * BYTES_PER_PIXEL_OF_FILTER,
         )
-        if finished + least > budget.size:
+        if finished + least > budget:
             raise UsageError(
                 f"a picture of {width}x{height} pixels needs {_text(finished + least)} of memory, "
-                f"and {_text(budget.size)} may be used: choose a smaller width and height, "
+                f"and {_text(budget)} may be used: choose a smaller width and height, "
                 f"fewer layers or samples, or a larger memory="
             )
-        return cls(budget.size - finished)
+        return cls(budget - finished)
 
     def wavefront_size(self, channels: int) -> int:
         """Return the number of rays of a wavefront that returns ``channels`` values each."""

@@ -12,7 +12,6 @@ import mitsuba as mi
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.files.replacing import replacing
-from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import StrPath
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation import laws
@@ -127,7 +126,7 @@ def check_scene(
     progress = progress or Progress()
     settings = RenderSettings.of(**options)
     runtime.use(settings.variant)
-    source = open_with(scene, settings, Budget.of(settings.memory))
+    source = open_with(scene, settings)
 
     def each(plugins: Sequence[Any]) -> Iterator[Any]:
         with progress.stage("Laws", len(plugins)) as advance:

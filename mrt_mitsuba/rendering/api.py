@@ -24,7 +24,7 @@ from mrt_mitsuba.files import images
 from mrt_mitsuba.files.layers import AVERAGED
 from mrt_mitsuba.files.layers import TABLE as LAYER_TABLE
 from mrt_mitsuba.interrupts import defer_signals
-from mrt_mitsuba.machine import Budget, Workspace
+from mrt_mitsuba.machine import Workspace, budget
 from mrt_mitsuba.options import Values
 from mrt_mitsuba.rendering.exposing import FILM_PREFIX
 from mrt_mitsuba.rendering.passes import Passes
@@ -180,7 +180,7 @@ def render(  # noqa: PLR0913 - each option has a name that editors show
     scene = options.pop("scene")
     settings = RenderSettings(**options)
     with session(settings) as job:
-        return render_source(open_with(scene, settings, job.budget), settings, job)
+        return render_source(open_with(scene, settings), settings, job)
 
 
 if render.__doc__:  # None under ``python -OO``
@@ -205,8 +205,7 @@ def session(settings: RenderSettings) -> Iterator[Job]:
     refuse_freezing()
     with runtime.render_lock, defer_signals(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        budget = Budget.of(settings.memory)
-        job = Job(settings.progress or default_progress(), budget, settings.on_round)
+        job = Job(settings.progress or default_progress(), budget(settings.memory), settings.on_round)
         variant = runtime.use(settings.variant)
         try:
             yield job
@@ -219,13 +218,14 @@ def session(settings: RenderSettings) -> Iterator[Job]:
             raise
 
 
-def open_with(scene: Any, settings: RenderSettings, budget: Budget) -> Source:
+def open_with(scene: Any, settings: RenderSettings) -> Source:
     """Load a scene as the options of a render say; see ``render`` for what it may be."""
-    given: dict[str, Any] = {
-        field.name: value if (value := getattr(settings, field.name)) is not field.default else None
+    given = {
+        field.name: value
         for field in dataclasses.fields(settings)
+        if (value := getattr(settings, field.name)) is not field.default
     }
-    return open_scene(scene, budget=budget, **{**given, "sensor": settings.sensor})
+    return open_scene(scene, **given)
 
 
 def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
@@ -256,7 +256,7 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
             options=plan.options,
             versions=runtime.versions(),
             camera=camera_matrices(source.sensor),
-            inputs=frozenset(os.path.abspath(path) for path in job.budget.inputs),
+            inputs=frozenset(os.path.abspath(path) for path in source.inputs),
             error=error,
             rounds=tuple(picture.rounds),
         )

@@ -82,7 +82,7 @@ class Prepared:
         """Render from scratch; later results differ from this one by the picture."""
         settings = replace(self._settings, seed=seed)
         with session(settings) as job:
-            self._source = self._source or open_with(self._scene, settings, job.budget)
+            self._source = self._source or open_with(self._scene, settings)
             self._made = render_source(self._source, settings, job)
             self._job = job
         return self._made

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.files.replacing import replacing
-from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import StrPath, Values, check, choice
 from mrt_mitsuba.scene.loading import load_file
 from mrt_mitsuba.scene.model import FLAVORS, SIZE, Node, Scene
 from mrt_mitsuba.scene.open import in_terms
 from mrt_mitsuba.scene.report import report_scene, scene_dict
 from mrt_mitsuba.scene.stock import stock
-
-if TYPE_CHECKING:
-    pass
 
 
 def write_xml(
@@ -47,6 +42,7 @@ def write_xml(
     check("flavor", choice(*FLAVORS), flavor)
     terms = in_terms(scene, model)
     files: dict[str, bytes] = {}  # of shapes, by their paths
+    inputs: set[str] = set()
     focus: dict[str, object] = {}  # what Mitsuba's cameras have no parameters for, and ``render`` reads
     if terms is None and isinstance(scene, str | os.PathLike):
         given = {"fresnel": fresnel, "width": width, "height": height, "flavor=stock": flavor == "stock"}
@@ -54,10 +50,8 @@ def write_xml(
             if value:
                 raise UsageError(f"{name} is of no use with an XML file, which is written as it is")
         runtime.use()
-        budget = Budget.of(None)
-        text, values = load_file(os.fspath(scene), params or {}, budget, as_text=True)
+        text, values = load_file(os.fspath(scene), params or {}, inputs, as_text=True)
         focus = {name: values[name] for name in ("focaldist", "focalrange") if name in values}
-        inputs: Iterable[str] = budget.inputs
     elif params:
         raise UsageError(f"params: only an XML file declares names, such as {next(iter(params))}")
     else:
@@ -75,7 +69,7 @@ def write_xml(
         text = mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(variant), nodes))
         if terms.focal_distance is not None:
             focus = {"focaldist": terms.focal_distance, "focalrange": terms.focal_range}
-        inputs = terms.files
+        inputs |= terms.files
     lines = "".join(f'\n    <default name="{name}" value="{value}"/>' for name, value in focus.items())
     before, tag, after = re.split("(<scene[^>]*>)", text, maxsplit=1)
     text = f"{before}{tag}{lines}{after}\n"

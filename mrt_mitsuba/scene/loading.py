@@ -25,7 +25,6 @@ import numpy as np
 
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.interrupts import defer_signals
-from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home
 from mrt_mitsuba.options import Values
 
@@ -43,7 +42,7 @@ _ORIGIN = re.compile(
 def load_dict(
     scene: Values,
     name: str = "the dict",
-    budget: Budget | None = None,
+    inputs: set[str] | None = None,
     *,
     merge: bool = True,
     keys: Values | None = None,
@@ -51,22 +50,22 @@ def load_dict(
     """Load a Mitsuba dict: a scene, or any other object.
 
     ``merge``: make one of meshes of the same material, as Mitsuba does, which leaves them in any order;
-    ``keys``: values by keys such as ``ball.center``, see ``_instantiate``.
-    Raises ``SceneError`` that calls it ``name``, and ``UsageError`` for an unknown key, a value of the wrong
-    type, or a texture too large for the budget.
+    ``keys``: values by keys such as ``ball.center``, see ``_instantiate``. The files that it names are added
+    to ``inputs``. Raises ``SceneError`` that calls it ``name``, and ``UsageError`` for an unknown key or a
+    value of the wrong type.
     """
-    budget = budget or Budget.of(None)
+    inputs = set() if inputs is None else inputs
     with _loading(name):
-        _check_dict(scene, budget.inputs)
+        _check_dict(scene, inputs)
         state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)
-        _check_nodes(state.nodes, budget)
+        _check_nodes(state.nodes, inputs)
         return _instantiate(state, merge, keys or {})
 
 
 def load_file(
     path: str,
     params: Values,
-    budget: Budget | None = None,
+    inputs: set[str] | None = None,
     *,
     options: Values | None = None,
     as_text: bool = False,
@@ -74,11 +73,11 @@ def load_file(
     """Return the scene of an XML file, and the values of its ``$parameters``.
 
     ``params``: values by the names of parameters, and by keys such as ``ball.center``; ``options``: those of
-    a render, whose values are used for parameters of the same names, and None for those not given.
+    a render, whose values are used for parameters of the same names.
     ``as_text``: return it as XML, with includes and parameters filled in, and files by their whole path.
 
-    Raises ``SceneError``, and ``UsageError`` for another kind of file, a parameter or key that is not in it,
-    or a texture too large for the budget.
+    The files that are read are added to ``inputs``. Raises ``SceneError``, and ``UsageError`` for another
+    kind of file, a parameter or key that is not in it.
     """
     from mrt_mitsuba.scene.expansion import Expansion
     from mrt_mitsuba.scene.files import require_file
@@ -86,10 +85,11 @@ def load_file(
     require_file(path)
     if not path.lower().endswith(".xml"):
         raise UsageError(f"cannot read {path}: a scene file ends in .xml or .obj")
-    budget = budget or Budget.of(None)
+    inputs = set() if inputs is None else inputs
     keys = {key: value for key, value in params.items() if "." in key}
     given = {name: str(value) for name, value in params.items() if name not in keys}
-    offered = {name: str(value) for name, value in (options or {}).items() if value is not None} | given
+    numbers = {name: value for name, value in (options or {}).items() if isinstance(value, str | int | float)}
+    offered = {name: str(value) for name, value in numbers.items()} | given
     with _loading(path, os.path.dirname(path) or "."):
         expansion = Expansion(dict(offered))
         expansion.read(path)
@@ -97,8 +97,8 @@ def load_file(
         config = mi.parser.ParserConfig(mi.variant())
         config.unused_parameters = mi.LogLevel.Debug  # a file has few of the options
         state = mi.parser.parse_file(config, path, **offered)
-        budget.inputs.update(map(str, state.files))
-        _check_nodes(state.nodes, budget)
+        inputs.update(map(str, state.files))
+        _check_nodes(state.nodes, inputs)
         if not as_text:
             return _instantiate(state, True, keys), expansion.values
         for node in state.nodes:
@@ -112,7 +112,7 @@ def load_file(
 # ---------------------------------------------- Mitsuba's parser ---------------------------------------
 
 
-def _check_nodes(nodes: Iterable[mi.parser.SceneNode], budget: Budget) -> None:
+def _check_nodes(nodes: Iterable[mi.parser.SceneNode], inputs: set[str]) -> None:
     """Check the plugins, sample counts and files of parsed nodes."""
     mitsuba_first()  # a <path> of the file puts its folder before
     for node in nodes:
@@ -123,7 +123,7 @@ def _check_nodes(nodes: Iterable[mi.parser.SceneNode], budget: Budget) -> None:
         if isinstance(samples, int) and not 1 <= samples <= MAX_SAMPLE_COUNT:
             raise RuntimeError(f"{kind}: sample_count is {samples}; give 1 to {MAX_SAMPLE_COUNT}")
         if isinstance(filename, str):
-            _check_data(filename, budget.inputs)
+            _check_data(filename, inputs)
 
 
 def _instantiate(state: mi.parser.ParserState, merge: bool, keys: Values) -> mi.Object:

@@ -13,11 +13,10 @@ import mitsuba as mi
 
 from mrt_mitsuba.adaptive.target import AdaptiveIntegrator, Goal, Target
 from mrt_mitsuba.errors import SceneError, UsageError, warn
-from mrt_mitsuba.machine import Budget
 from mrt_mitsuba.options import Values, is_obj, is_path
 from mrt_mitsuba.plugins.variants import text_of
 from mrt_mitsuba.scene.loading import load_dict, load_file
-from mrt_mitsuba.scene.model import FOCAL_RANGE, MODEL_OPTIONS, SIZE, Scene
+from mrt_mitsuba.scene.model import FOCAL_RANGE, MODEL_OPTIONS, Scene
 from mrt_mitsuba.scene.report import report_scene
 
 MAX_FILTER_RADIUS = 1024  # pixels
@@ -38,28 +37,20 @@ class Source:
     fresnel: str | None = None  #: Fresnel formula of the report's scenes
     own: bool = False  #: True for a user's scene, whose film and sampler count
     goal: Goal | None = None  #: adaptive goal of its integrator, if it has one
+    inputs: frozenset[str] = frozenset()  #: paths of the files that it was read from
 
 
-def open_scene(
-    scene: object,
-    *,
-    width: int | None = None,
-    height: int | None = None,
-    fresnel: str | None = None,
-    integrator: object = None,
-    sensor: int = 0,
-    params: Values | None = None,
-    budget: Budget | None = None,
-    **options: Any,
-) -> Source:
-    """Load a scene by the options of ``render``; see there for what it may be.
+def open_scene(scene: object, **given: Any) -> Source:
+    """Load a scene by the options of ``render`` that are given; see there for what it may be.
 
-    ``budget``: memory from which its textures take theirs. Of other options, those of ``obj_scene`` are for
-    OBJ files, and any is the value of a parameter of an XML file that has the same name.
-    Raises ``SceneError`` or ``UsageError``.
+    The values of options are those of parameters of an XML file that have the same names. Raises
+    ``SceneError`` or ``UsageError``.
     """
-    params = params or {}
-    model = {name: options[name] for name in MODEL_OPTIONS if options.get(name) is not None}
+    params = given.pop("params", None) or {}
+    integrator = given.get("integrator")
+    fresnel = given.get("fresnel")
+    size = {name: given[name] for name in ("width", "height") if given.get(name)}
+    model = {name: given[name] for name in MODEL_OPTIONS if name in given}
     if isinstance(model.get("target"), Target):
         del model["target"]  # of the error
     terms = in_terms(scene, model)
@@ -68,16 +59,15 @@ def open_scene(
         raise UsageError(
             f"params: {names[0]} is not a key of mi.traverse, and only an XML file declares names"
         )
+    inputs: set[str] = set()
     if terms is not None:
-        if budget is not None:
-            budget.inputs.update(terms.files)
+        inputs |= terms.files
         fresnel = fresnel or "schlick"
         name = terms.title or "a scene"
         if isinstance(scene, SupportsIndex):
             name = str(operator.index(scene))
-        nodes = terms.to_dict(width=width or SIZE[0], height=height or SIZE[1], fresnel=fresnel)
         # its meshes have a material each: kept apart, they stay in order, and a file has the same layers
-        loaded = load_dict(nodes, name, budget, merge=False, keys=params)
+        loaded = load_dict(terms.to_dict(**size, fresnel=fresnel), name, inputs, merge=False, keys=params)
         distance = terms.focal_distance
         reach = terms.focal_range
     else:
@@ -85,24 +75,18 @@ def open_scene(
             raise UsageError(
                 "fresnel is for the report's scenes; in a scene of your own, it is a parameter of mrt_bsdf"
             )
-        given = {"width": width, "height": height, "integrator": integrator, "sensor": sensor or None}
-        plain = {
-            key: value if isinstance(value, str | int | float) else None
-            for key, value in (options | given).items()
-        }
-        name, loaded, values = _loaded(scene, budget, params, plain)
+        name, loaded, values = _loaded(scene, inputs, params, given)
         distance = _number(values, "focaldist", None)
         reach = _number(values, "focalrange", FOCAL_RANGE)
-    view = _sensor(name, loaded, sensor)
-    source = opened(name, loaded, view, _integrator(name, integrator, loaded))
+    view = _sensor(name, loaded, given.get("sensor", 0))
     return replace(
-        source,
-        width=width or source.width,
-        height=height or source.height,
+        opened(name, loaded, view, _integrator(name, integrator, loaded)),
+        **size,
         focal_distance=distance,
         focal_range=reach,
         fresnel=fresnel,
         own=terms is None,
+        inputs=frozenset(inputs),
     )
 
 
@@ -138,14 +122,15 @@ def sized(source: Source) -> Iterator[None]:
 
 
 def _loaded(
-    scene: object, budget: Budget | None, params: Values, options: Values
+    scene: object, inputs: set[str], params: Values, options: Values
 ) -> tuple[str, mi.Scene, Mapping[str, str]]:
-    """Return the name of a user's scene, the Mitsuba scene, and the parameters of its file."""
+    """Return the name of a user's scene, the Mitsuba scene, and the parameters of its file; note its files in
+    ``inputs``."""
     if isinstance(scene, dict):
-        return "a dict", load_dict(scene, budget=budget, keys=params), {}
+        return "a dict", load_dict(scene, inputs=inputs, keys=params), {}
     if isinstance(scene, str | os.PathLike):
         path = os.fspath(scene)
-        return os.path.basename(path), *load_file(path, params, budget, options=options)
+        return os.path.basename(path), *load_file(path, params, inputs, options=options)
     if isinstance(scene, mi.Scene):
         if params:
             raise UsageError("params are for scenes to be loaded: change a loaded one by mi.traverse")

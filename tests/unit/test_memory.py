@@ -11,7 +11,7 @@ from cases import Cases
 
 from mrt_mitsuba import machine, runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.machine import Budget, Workspace, usable_cores
+from mrt_mitsuba.machine import Workspace, budget, usable_cores
 
 GIB = 2**30
 
@@ -29,7 +29,7 @@ GIB = 2**30
 )
 def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
     with pytest.raises(UsageError, match=f"16384x16384 pixels needs {needed} of memory, and 4.0 GiB may be"):
-        Workspace.from_budget(16384, 16384, 3, budget=Budget(4 * GIB), **more)
+        Workspace.from_budget(16384, 16384, 3, budget=4 * GIB, **more)
 
 
 def show(group: Path, files: dict[str, str]) -> Path:
@@ -88,6 +88,6 @@ def test_drjit_has_as_many_threads_as_cores_but_two(monkeypatch, variant):
 
 def test_half_of_what_is_free_is_used_unless_asked_for(monkeypatch):
     monkeypatch.setattr(machine, "memory", lambda: (2**33, 2**35))
-    assert Budget.of(None).size == 2**32
-    assert Budget.of(2**34).size == 2**34
-    assert Budget.of(2**36).size == 2**35
+    assert budget(None) == 2**32
+    assert budget(2**34) == 2**34
+    assert budget(2**36) == 2**35
