@@ -138,12 +138,12 @@ def compare_pictures(variants: Sequence[str], names: Sequence[str]) -> Iterator[
 
 
 def run_tests(device: str, tests: Sequence[str], deadline: float) -> Iterator[bool]:
-    """Run files of device tests, each in its process, and those of a file that crashed one by one.
+    """Run files of device tests, each in a process whose crash costs the test that crashed it.
 
-    Print a line for each; yield whether it passed.
+    Print a line for each file and for each test that fails; yield whether all of a file passed.
     """
     marked = "device and not package and not slow"
-    command = [sys.executable, "-m", "pytest", "-q", "--no-header", "-m", marked]
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "1", "-m", marked]
     run = partial(subprocess.run, env=os.environ | {"MRT_DEVICE": device}, capture_output=True, text=True)
     for test in tests:
         left = deadline - time.monotonic()
@@ -158,13 +158,9 @@ def run_tests(device: str, tests: Sequence[str], deadline: float) -> Iterator[bo
             continue
         if done.returncode == 5:  # no device tests
             continue
-        crashed = done.returncode < 0
-        ending = (done.stdout.strip().splitlines() or [""])[-1]
-        print(f"{test}: {f'CRASHED by signal {-done.returncode}' if crashed else ending}", flush=True)
-        if crashed and "::" not in test:
-            listed = run([*command, "--collect-only", test]).stdout.splitlines()
-            each = [f"{test}::{line.split('::', 1)[1]}" for line in listed if "::" in line]
-            yield from run_tests(device, each, deadline)
+        failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+        ending = done.stdout.strip().rpartition("\n")[2]
+        print(f"{test}: {ending}", *failed, sep="\n  ", flush=True)
         yield done.returncode == 0
 
 
