@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -175,28 +175,22 @@ class Findings:
             times[name] = tuple(_crossing(*curve, error) for curve in zip(seconds, errors, strict=True))
         return times
 
-    def race(self, error: float) -> Values:
-        """Return which case is the fastest to an error, how long it takes, and what comes next.
+    def verdict(self, error: float) -> str:
+        """Say which case is the fastest to an error, how long it takes, and what comes next.
 
         There is no winner where the intervals of other curves overlap with that of the first.
         """
-        (best, times), *others = sorted(self.time_to(error).items(), key=lambda item: item[1])
-        rivals = [name for name, (_, least, _) in others if not times[2] < least]
-        row: Values = {"error": error, "use": "nothing comes so low", "seconds": None}
-        row |= {"next best": None, "times as long": None}
+        (best, times), *others = sorted(self.time_to(error).items(), key=itemgetter(1))
         if math.isinf(times[0]):
-            return row
-        row["seconds"] = _shown(*times)
+            return f"RMSE of {error:g}: nothing comes so low."
+        rivals = [name for name, (_, least, _) in others if not times[2] < least]
         if rivals:
-            return row | {"use": f"no winner: {'; '.join([best, *rivals])}"}
-        row["use"] = next(p.name for p in self.families[best] if p.rmse <= error * (1 + 1e-9))
+            return f"RMSE of {error:g}: no winner: {'; '.join([best, *rivals])}, {_shown(*times)} s."
+        case = next(p.name for p in self.families[best] if p.rmse <= error * (1 + 1e-9))
+        sentence = f"RMSE of {error:g}: {case}, {_shown(*times)} s"
         if others and math.isfinite(others[0][1][0]):
-            row |= {"next best": others[0][0], "times as long": others[0][1][0] / times[0]}
-        return row
-
-    def advice(self) -> list[Values]:
-        """Return a row for each of ``errors``, see ``race``."""
-        return [self.race(error) for error in self.errors]
+            sentence += f"; {others[0][0]} takes {others[0][1][0] / times[0]:.2g} times as long"
+        return f"{sentence}."
 
     @property
     def verdicts(self) -> list[str]:
@@ -205,15 +199,7 @@ class Findings:
             return ["No verdict on time: a single repeat has no interval."]
         if self.points and not self.errors:
             return ["No verdict on time: no case has an error that the reference can resolve."]
-        sentences = []
-        for row in self.advice():
-            sentence = f"RMSE of {row['error']:g}: {row['use']}"
-            if row["seconds"]:
-                sentence += f", {row['seconds']} s"
-            if row["next best"]:
-                sentence += f"; {row['next best']} takes {row['times as long']:.2g} times as long"
-            sentences.append(f"{sentence}.")
-        return sentences
+        return [self.verdict(error) for error in self.errors]
 
     def __str__(self) -> str:
         lines = [self.warning] if self.warning else []
@@ -481,7 +467,7 @@ def diagram(title: str, found: Findings) -> Figure:
 
 
 def describe(study: Study, found: Findings, title: str, name: str = "") -> None:
-    """Add the diagram, the answers and the tables to a study, under names that start with ``name``."""
+    """Add the answers, the diagram and the tables to a study, under names that start with ``name``."""
     prefix = name and f"{name}-"
     failed = [{"case": case, "why": why} for case, why in found.failed.items()]
     study.at_most(f"cases that failed: {title}", len(failed), 0, "each of them could be rendered")
@@ -494,11 +480,10 @@ def describe(study: Study, found: Findings, title: str, name: str = "") -> None:
     own = f"about {found.reference_error:.2g}" if found.reference_error else "not known"
     caption = (
         "Down and to the left is better. Yellow: the best at each error; grey: curves that are never the "
-        f"best. Bars: 95 % intervals. The reference's own RMSE is {own}. "
+        f"best. Bars: 95 % intervals. The reference's own RMSE is {own}."
     )
-    study.picture(f"{prefix}diagram", title, diagram(title, found), caption + " ".join(found.verdicts))
-    if found.errors:
-        study.records(f"{prefix}advice", f"{title}: what to use", found.advice(), first=not name)
+    study.texts += [f"{title}. {verdict}" for verdict in found.verdicts]
+    study.picture(f"{prefix}diagram", title, diagram(title, found), caption)
     note = "Medians of warm renders without loading the scene; cold: the first run. Errors in linear light."
     points = [point.row() for curve in found.families.values() for point in curve]
     study.records(f"{prefix}points", f"{title}: every case", points, note)

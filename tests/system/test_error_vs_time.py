@@ -216,28 +216,27 @@ XML = """<scene version="3.0.0">
 
 
 races = Cases()
-races([2.0, 2.1, 1.9, 2.05], 0.1, 0.1, "a", "b")
-races([0.9, 1.3, 0.8, 1.4], 0.1, 0.1, "no winner: a; b", None)
-races([1.0] * 4, 0.2, 0.1, "a", None)
-races([1.0] * 4, 0.2, 1e-3, "nothing comes so low", None)
+races([2.0, 2.1, 1.9, 2.05], 0.1, 0.1, ": a, 1.02 (0.863 to 1.22) s; b takes 2 times as long.")
+races([0.9, 1.3, 0.8, 1.4], 0.1, 0.1, ": no winner: a; b, 1.02 (0.863 to 1.22) s.")
+races([1.0] * 4, 0.2, 0.1, ": a, 1.02 (0.863 to 1.22) s.")
+races([1.0] * 4, 0.2, 1e-3, ": nothing comes so low.")
 
 
-@pytest.mark.parametrize(("times", "rmse", "error", "use", "next_best"), races)
-def test_a_winner_is_named_only_if_intervals_are_apart(times, rmse, error, use, next_best):
+@pytest.mark.parametrize(("times", "rmse", "error", "said"), races)
+def test_a_winner_is_named_only_if_intervals_are_apart(times, rmse, error, said):
     found = found_of(point("a", [1.0, 1.1, 0.9, 1.05]), point("b", times, rmse))
-    row = found.race(error)
-    assert (row["use"], row["next best"]) == (use, next_best)
-    for row, verdict in zip(found.advice(), found.verdicts, strict=True):
-        assert f"RMSE of {row['error']:g}: {row['use']}" in verdict
-        assert verdict in str(found)
+    assert found.verdict(error) == f"RMSE of {error:g}{said}"
+    assert found.verdicts == [found.verdict(error) for error in found.errors]
+    assert all(verdict in str(found) for verdict in found.verdicts)
 
 
-@pytest.mark.parametrize(("spread", "use"), [(1e-3, "a"), (0.5, "no winner: a; b")])
-def test_a_curve_that_may_come_so_low_has_not_lost(spread, use):
+@pytest.mark.parametrize(("spread", "decided"), [(1e-3, True), (0.5, False)])
+def test_a_curve_that_may_come_so_low_has_not_lost(spread, decided):
     """The error of b is 0.11; pictures that differ widely leave in doubt whether it is 0.1."""
     gram = 0.11**2 * np.diag(1 + spread * np.array([-1, 1, -1, 1]))
     times = [1.0, 1.1, 0.9, 1.05]
-    assert found_of(point("a", times), point("b", times, 0.11, gram)).race(0.1)["use"] == use
+    found = found_of(point("a", times), point("b", times, 0.11, gram))
+    assert ("no winner: a; b" in found.verdict(0.1)) is not decided
 
 
 @pytest.mark.parametrize("reference_error", [0.0, 0.1])
@@ -267,7 +266,7 @@ def test_intervals_cover_what_they_should_and_equal_cases_have_no_winner(count):
         ends = p.seconds_interval, p.rmse_interval, p.bias_interval
         held += [low <= value <= high for value, (low, high) in zip(true, ends, strict=True)]
         equal = found_of(point("a", times[0]), point("b", times[1]))
-        winners += "no winner" not in equal.race(0.1)["use"]
+        winners += "no winner" not in equal.verdict(0.1)
     assert (held >= 0.88 * trials).all(), held
     assert winners <= 0.05 * trials
 
@@ -289,7 +288,7 @@ def test_command_writes_a_page(tmp_path, capsys, variant):
     assert main(["error-vs-time", "3", f"cases={cases}", f"out={out}"]) == 0
     assert "index.html" in capsys.readouterr().out
     names = {path.name.removeprefix("error-vs-time-") for path in out.iterdir()}
-    assert {"index.html", "summary.json", "diagram.png", "points.csv", "advice.csv"} <= names
+    assert {"index.html", "summary.json", "diagram.png", "points.csv"} <= names
     cases.write_text(GOOD + '"bad" = {aa = 1, lattice = "none"}\n')
     assert main(["error-vs-time", "scene=3", f"cases={cases}", f"out={out}"]) == 1
     assert "bad" in capsys.readouterr().out
