@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +14,9 @@ from mrt_mitsuba.validation.work_precision import Findings, describe, error_vs_t
 TITLE = "Error against run time"
 
 BOX = "Cornell box"
+SCENES = (0, 1, 2, 3, 4, 7, 9, BOX)
+# Scenes of broad highlights: elsewhere rare, very bright paths dominate every mean square of ``path``
+CALM = (0, 7, 9)
 
 Number = int | str  # of a scene of the report, or ``BOX``
 
@@ -61,11 +63,9 @@ DOCS = Cost(
 
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
-    jobs = [(name, number) for name in MEASURED for number in ((0,) if quick else SCENES[name])]
-    for name, number in study.each("Error against time", jobs):
-        found = MEASURED[name](number, QUICK if quick else Cost())
-        describe(study, found, f"{title_of(number)}: {TITLES[name]}", f"{title_of(number)}, {name}")
-        del found  # what it holds is freed with it
+    for number in study.each(TITLE, (0,) if quick else SCENES):
+        for title, found in choices(number, QUICK if quick else Cost()).items():
+            describe(study, found, title, title)
 
 
 def choices(number: Number, cost: Cost) -> dict[str, Findings]:
@@ -74,17 +74,12 @@ def choices(number: Number, cost: Cost) -> dict[str, Findings]:
     ``mrt_whitted`` and ``path`` converge to pictures of their own. The Cornell box has paths alone; scenes
     whose highlights are so narrow that rare paths dominate the error have none.
     """
-    found = {}
-    if isinstance(number, int):
-        found[f"{title_of(number)}, rays as in the report"] = sampling(number, cost)
-    if number == BOX or number in CALM:
-        found[f"{title_of(number)}, light paths"] = path(number, cost)
+    if number == BOX:
+        return {f"{BOX}, light paths": path(number, cost)}
+    found = {f"Scene {number}, rays as in the report": sampling(number, cost)}
+    if number in CALM:
+        found[f"Scene {number}, light paths"] = path(number, cost)
     return found
-
-
-def title_of(number: Number) -> str:
-    """Return a scene's name."""
-    return f"Scene {number}" if isinstance(number, int) else number
 
 
 def _scene(number: Number, size: tuple[int, int]) -> Values:
@@ -110,7 +105,7 @@ def _rounds(cost: Cost, **options: Any) -> dict[str, Values]:
 MODES = {"none": "every pixel", "luma": "luma edges", "sobel": "Sobel edges", "geometry": "geometry edges"}
 
 
-def sampling(number: int, cost: Cost) -> Findings:
+def sampling(number: Number, cost: Cost) -> Findings:
     """Measure numbers of samples on both lattices, modes of anti-aliasing, and adaptive sampling."""
     cases = _rounds(cost, focaldist=0)
     for aa in cost.amounts:
@@ -132,9 +127,9 @@ def path(number: Number, cost: Cost) -> Findings:
             sensor = nodes["sensor"] | {"sampler": {"type": sampler}}
             own = {"scene": nodes | {"sensor": sensor}, "integrator": "path"}
             cases[f"path, {sampler}, spp={spp}"] = own | {"spp": spp}
-        if number in CALM:
+        if number != BOX:
             cases[f"direct, spp={spp}"] = {"integrator": "direct", "spp": spp}
-    if number in CALM:
+    if number != BOX:
         cases["mrt_whitted"] = {}
     return error_vs_time(
         nodes,
@@ -143,14 +138,3 @@ def path(number: Number, cost: Cost) -> Findings:
         shared={"aa": 1, "aamode": "none"},
         repeats=cost.repeats,
     )
-
-
-MEASURED: dict[str, Callable[[Any, Cost], Findings]] = {"sampling": sampling, "path": path}
-TITLES = {
-    "sampling": "anti-aliasing mode, aa and lattice",
-    "path": "Whitted, direct and path at rising spp, against a converged path",
-}
-ALL = (0, 1, 2, 3, 4, 7, 9)
-# Under path, scenes of broad highlights: elsewhere rare, very bright paths dominate every mean square
-CALM = (0, 7, 9)
-SCENES: dict[str, tuple[Number, ...]] = {"sampling": ALL, "path": (*ALL, BOX)}
