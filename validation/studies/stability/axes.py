@@ -31,6 +31,7 @@ OURS = "ours"
 THEIRS = "Mitsuba"
 LEAST = 0.3  # roundings: as good as exact
 NONE_RIGHT = 2.0**24  # roundings: no digit is right
+STEEPEST = 4.0
 WORST = 0.99  # the share of the samples that stay below the figure shown
 
 Curves = dict[str, Array]  # roundings [places] by ``OURS``, ``THEIRS``
@@ -67,7 +68,7 @@ def show(study: Study, *, quick: bool) -> None:
             lines[side] = np.clip(quantiles, LEAST, NONE_RIGHT)
         ours = lines[OURS].max()
         title = f"{axis.title} along the {axis.label}"
-        why = "the limit of the tables below, in roundings; worst place of this axis"
+        why = "three times what was measured; the worst place of this axis"
         study.at_most(f"roundings of the {title}", ours, axis.limit, why)
         row = {"what": axis.title, "along": axis.label, "promised": axis.limit, "ours, worst": ours}
         row |= {f"{THEIRS}, worst": lines[THEIRS].max(), "Mitsuba's closest plugin": axis.nearest}
@@ -103,13 +104,13 @@ def _off(ours: object, theirs: object, truth: Array) -> Curves:
 # ------------------------------------------ Reflectance ------------------------------------------
 
 
-def lobes(cosine: Array, alpha: float, steepest: float = 4.0) -> Curves:
+def lobes(cosine: Array, alpha: float) -> Curves:
     """Measure the lobe D G / (4 cos θi), without Fresnel, for light from these cosines [N].
 
-    tan²θh / alpha² of half vectors is at most ``steepest``: D is at least exp(-steepest) of its peak.
+    tan²θh / alpha² of half vectors is at most ``STEEPEST``: D is at least exp(-STEEPEST) of its peak.
     """
     rng = np.random.default_rng(11)
-    wi, wo = pairs_about(cosine, alpha * np.sqrt(steepest * rng.random(len(cosine))), rng)
+    wi, wo = pairs_about(cosine, alpha * np.sqrt(STEEPEST * rng.random(len(cosine))), rng)
     up = wo[:, 2] > 5e-8
     wi = wi[up]
     wo = wo[up]
@@ -216,13 +217,13 @@ def axial(kind: type[Cone] | type[Cylinder], slender: float, count: int) -> Curv
     return _hits(thing, targets, eyes, stock if kind is Cylinder else None)
 
 
-LOBE = 2e-5 / ROUNDING
+LOBE = 48  # roundings
 HIT = 16
 cone = partial(axial, Cone)
 cylinder = partial(axial, Cylinder)
 AXES = (
-    Axis("value of a highlight", "roughness α", "roughconductor", (-5, 0), roughness, LOBE),
-    Axis("Fresnel reflectance", "index of refraction − 1", "mi.fresnel", (-7, 8), index, 2e-6 / ROUNDING),
+    Axis("value of a highlight", "roughness α", "roughconductor", (-8, 0), roughness, LOBE),
+    Axis("Fresnel reflectance", "index of refraction − 1", "mi.fresnel", (-7, 8), index, 32),
     Axis("value of a highlight", "cosine of the light", "roughconductor", (-8, 0), grazing, LOBE),
     Axis("hit with a floor", "distance / height of the eye", "rectangle", (0, 6), floor, HIT),
     Axis("hit with a cone", "height / radius", "256-sided mesh", (-4, 4), cone, HIT),

@@ -1,9 +1,9 @@
-"""Tables of stiff and extreme cases: the reflectance, light paths, scenes that are scaled or moved."""
+"""Stiff and extreme cases with limits: the reflectance, light paths, scenes that are scaled or moved."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,65 +15,34 @@ from mrt_mitsuba.scene.report import report_scene
 from mrt_mitsuba.validation.laws.bsdf import check_bsdf
 from mrt_mitsuba.validation.oracles.reference import reference_render, unit
 from mrt_mitsuba.validation.studies.stability import axes
-from mrt_mitsuba.validation.study import Values
-
-
-@dataclass(frozen=True)
-class Case:
-    """A measured figure, with the reason for its limit or for having no limit."""
-
-    name: str
-    what: str  #: is measured
-    why: str  #: it is held to its limit, or cannot hold
-    measured: float
-    limit: float | None  #: that it must not exceed; None where nothing can be promised
-
+from mrt_mitsuba.validation.study import Study, Values
 
 # ----------------------------------------------- Reflectance -----------------------------------------------
 
-REFLECTANCE = (
-    "Relative errors at the same float32 numbers against 50 digits. Directions are what their components "
-    "say, and the half vector is their sum."
-)
-STEEPEST = -np.log(1e-20)  # of tan²θh / alpha²: there the lobe is at 1e-20 of its peak
-IORS = np.array([1.5, 1.33, 3, 1 + 1e-7, 1 - 1e-7, 0.5, 1e-3, 1e6], np.float32)
 EXTREME = (0.0, 1e-8, 1e-3, 1.0, 100.0, -0.4)  # roughnesses
+IORS = (1 + 1e-7, 1e-3)
 
 
-def reflectance(quick: bool) -> Iterator[Case]:
-    """Yield errors of the lobe and of F, and whether all is finite."""
-    count = 60 if quick else 600
-    rng = np.random.default_rng(4)
-    where = "D ≥ 1e-20 of its peak, cosines 1e-7 … 1"
-    # the argument of exp goes to 46: 46 times the 4 roundings of tan²/alpha², and those of the other factors
-    why = "a few roundings, which exp enlarges"
-    for alpha in np.logspace(-8, 2, 11).tolist():
-        found = axes.lobes(10 ** rng.uniform(-7, 0, count), alpha, STEEPEST)[axes.OURS]
-        yield Case(f"value, alpha {alpha:g}", where, why, found.max() * axes.ROUNDING, 2e-5)
-    cosines = np.float32(10 ** rng.uniform(-7, 0, count * len(IORS)))
-    error = axes.reflectances(cosines, np.repeat(IORS, count))[axes.OURS].max() * axes.ROUNDING
-    yield Case("F, largest", "cosines 1e-7 … 1, IOR 1e-3 … 1e6", "a few roundings", error, 2e-6)
-    # where total reflection begins, F ends in a square root: errors are those of g = 0
+def reflectance(study: Study, *, quick: bool) -> None:
+    """Hold F where total reflection begins, and values at extreme roughnesses."""
+    # there F ends in a square root: errors are those of g = 0
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
     critical = np.float32(np.sqrt((1 - np.float64(iors)) * (1 + np.float64(iors))))
     cosines = (critical.view(np.int32) + np.tile(np.arange(-40, 41, dtype=np.int32), 4)).view(np.float32)
-    what = "the 40 float32 cosines on either side of it, IOR 0.5 … 0.9999"
     why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
     error = axes.reflectances(cosines, iors)[axes.OURS].max() * axes.ROUNDING
-    yield Case("F at the critical angle", what, why, error, 16 * 2.0**-12)
-    what = "laws of finite values that fail, indices 1 + 1e-7 … 1e6"
+    study.at_most("error of F within 40 float32 cosines of the critical angle", error, 16 * 2.0**-12, why)
     for alpha in EXTREME:
         bsdfs = [
-            {"type": "mrt_bsdf", "fresnel": "dielectric", "alpha": alpha, "int_ior": float(n)}
-            for n in IORS[3::4]
+            {"type": "mrt_bsdf", "fresnel": "dielectric", "alpha": alpha, "int_ior": float(n)} for n in IORS
         ]
         failed = sum(len(check_bsdf(bsdf, quick=True, only=["finite"]).failed) for bsdf in bsdfs)
-        yield Case(f"finite, alpha {alpha:g}", what, "no value is NaN, infinite or negative", failed, 0)
+        why = "indices 1 + 1e-7 and 1e-3: no value is NaN, infinite or negative"
+        study.at_most(f"laws of finite values that fail, alpha {alpha:g}", failed, 0, why)
 
 
 # ---------------------------------------------- Light paths ----------------------------------------------
 
-PATHS = "Differences to the float64 tracer, relative to the value plus a thousandth, of 95 % of the pixels."
 # Differences count relative to the value plus a thousandth, and the worst of 95 % of the pixels is held to a
 # bound: the others may show outlines and the edges of shadows
 SMALL = 1e-3
@@ -107,23 +76,24 @@ def _hall(specular: float) -> Scene:
     return Scene(Camera((0.0, 0.1, 1.0), (0.05, 0.0, -2.0)), (0.2, 0.3, 0.4), (lamp,), (ball,), walls)
 
 
-def light_paths(quick: bool) -> Iterator[Case]:
-    """Yield scenes that are hard on a path tracer, held to the float64 tracer."""
+def light_paths(study: Study, *, quick: bool) -> None:
+    """Hold scenes that are hard on a path tracer to the float64 tracer."""
     hall: Values = {"fresnel": "unity"}
     bright = _lit((2, 3, 4), 1e4)
     unclamped: Values = {"clamp": False}
-    rows: list[tuple[str, str, Scene, float, Values]] = [
-        ("facing mirrors", "Ks 0.95, ten bounces", _hall(0.95), 2e-5, hall),
-        ("perfect facing mirrors", "Ks 1, ten bounces", _hall(1), 2e-5, hall),
-        ("clamp on", "a light of 1e4", bright, PLAIN, {}),
-        ("clamp off", "a light of 1e4", bright, PLAIN, unclamped),
-        ("light inside a ball", "not lit from outside", _lit((0, 0.5, 0)), PLAIN, {}),
-        ("light at 1e6", "parallel light", _lit((4e5, 6e5, 7e5)), PLAIN, {}),
-        ("black", "Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3), 3e-7, {}),
-        ("negative roughness", "alpha -0.4", _ball(alpha=-0.4, diffuse=(0, 0, 0)), 5e-6, unclamped),
+    rows: list[tuple[str, Scene, float, Values]] = [
+        ("facing mirrors of Ks 0.95, ten bounces", _hall(0.95), 2e-5, hall),
+        ("facing mirrors of Ks 1, ten bounces", _hall(1), 2e-5, hall),
+        ("a light of 1e4, clamped", bright, PLAIN, {}),
+        ("a light of 1e4, without clamp", bright, PLAIN, unclamped),
+        ("a light inside a ball, not lit from outside", _lit((0, 0.5, 0)), PLAIN, {}),
+        ("a light at 1e6, parallel light", _lit((4e5, 6e5, 7e5)), PLAIN, {}),
+        ("black, Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3), 3e-7, {}),
+        ("alpha -0.4, no diffuse part", _ball(alpha=-0.4, diffuse=(0, 0, 0)), 5e-6, unclamped),
     ]
-    for name, what, scene, limit, settings in rows:
-        yield Case(name, what, "roundings", path_error(scene, **settings), limit)
+    why = "roundings, relative to the value plus a thousandth, of 95 % of the pixels"
+    for name, scene, limit, settings in study.each("Light paths", rows):
+        study.at_most(f"path error: {name}", path_error(scene, **settings), limit, why)
 
 
 def path_error(scene: Scene, *, fresnel: str = "dielectric", clamp: bool = True) -> float:
@@ -149,21 +119,25 @@ SHARE_SCALED = 0.001
 SHARE_MOVED = 1e-4
 
 
-def placements(quick: bool) -> Iterator[Case]:
-    """Yield the share of pixels that change where the report's scenes are scaled, or moved by their sizes."""
+def placements(study: Study, *, quick: bool) -> None:
+    """Hold the share of pixels that change where the report's scenes are scaled, or moved by their sizes."""
     what = "share of pixels off by more than 2/255"
-    why = "coordinates have steps of 2⁻²³ of that distance: normals and outlines move"
+    rows: list[Values] = []
     # Scene 2 shows the horizon, which a far plane can cut off
-    for number in (0, 2) if quick else range(5):
+    for number in study.each("Placements", (0, 2) if quick else range(5)):
         scene = replace(report_scene(number), focal_distance=None)
-        name = f"scene {number}"
         for factor in (1e-6, 1e-3, 1e3, 1e6):
             off = changed(scene, factor, 0)
-            yield Case(f"{name} times {factor:g}", what, "the same picture", off, SHARE_SCALED)
+            study.at_most(f"{what}: scene {number} times {factor:g}", off, SHARE_SCALED, "the same picture")
         for sizes in (1.0, 10.0, 100.0, 1e3, 1e4):
-            # Very far away, float32 has no digits left for the scene
-            most = max(SHARE_MOVED * sizes, SHARE_SCALED) if sizes <= 100 else None
-            yield Case(f"{name} moved by {sizes:g} sizes", what, why, changed(scene, 1, sizes), most)
+            off = changed(scene, 1, sizes)
+            if sizes > 100:
+                rows.append({"scene": number, "moved by its size times": sizes, what: off})
+                continue
+            most = max(SHARE_MOVED * sizes, SHARE_SCALED)
+            why = "coordinates have steps of 2⁻²³ of that distance: normals and outlines move"
+            study.at_most(f"{what}: scene {number} moved by {sizes:g} sizes", off, most, why)
+    study.records("far", "Moved so far that float32 has no digits left: nothing can be promised", rows)
 
 
 def changed(scene: Scene, factor: float, sizes: float) -> float:
