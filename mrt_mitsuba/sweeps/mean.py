@@ -43,7 +43,9 @@ def mean_of_seeds(folder: str, job: Job, rows: Sequence[Facts]) -> Result:
             else:
                 layers[name] = layers.get(name, 0) + values / np.float32(len(rows))
     variance = squares / (len(rows) - 1) / len(rows)  # of the mean
-    layers.pop("variance", None)
+    for number, name in enumerate(("variance.R", "variance.G", "variance.B")):
+        if name in layers:
+            layers[name] = variance[..., number].astype(np.float32)
     layers["error.Y"] = np.sqrt(variance.mean(-1)).astype(np.float32)
     settings = RenderSettings.of(**job.arguments)
     with runtime.render_lock, runtime.within(settings.variant or runtime.use()):

@@ -415,6 +415,7 @@ def test_the_command_interrupted_from_the_keyboard_and_again(start, waiting, tmp
 
 def test_the_command_says_that_a_job_failed(address, tmp_path, capsys):
     lines = ["scene = 3", "width = 4096", "height = 4096", "aa = 1", 'memory = "64M"']
+    lines += ['cluster = "tcp://127.0.0.1:1"']  # which is given in the command as well
     (tmp_path / "sweep.toml").write_text("\n".join(lines))
     assert cli.main(["sweep", str(tmp_path / "out"), str(tmp_path / "sweep.toml"), f"cluster={address}"]) == 1
     assert "failed: " in capsys.readouterr().out
@@ -507,13 +508,16 @@ def test_mean_of_seeds(address, tmp_path):
     options: dict[str, Any] = {"width": 48, "height": 32, "integrator": "path"}
     mrt.register()
     scene = mi.cornell_box()
-    more = {"spp": 4, "layers": ["samples"], "cluster": address}
+    more = {"spp": 16, "aamode": "noise", "cluster": address}
     table = mrt.sweep(scene, tmp_path, grid={"seed": range(8)}, **more, **options)
     mean = table.mean()
-    pictures = np.stack([read_exr(tmp_path / row["file"]).image for row in table.rows])
+    every = [read_exr(tmp_path / row["file"]) for row in table.rows]
+    pictures = np.stack([each.image for each in every])
     assert np.allclose(mean.image, pictures.mean(0), rtol=1e-6)  # sums in float32
-    assert (mean.layers["samples.Y"] == 8 * 4).all()
-    deviation = np.sqrt(pictures.astype(np.float64).var(0, ddof=1).mean(-1) / 8)
+    assert np.array_equal(mean.layers["samples.Y"], sum(each.layers["samples.Y"] for each in every))
+    variance = pictures.astype(np.float64).var(0, ddof=1) / 8
+    assert np.allclose(mean.layers["variance.G"], variance[..., 1], rtol=1e-4, atol=1e-6)
+    deviation = np.sqrt(variance.mean(-1))
     assert np.allclose(mean.layers["error.Y"], deviation, rtol=1e-4, atol=1e-6)
     converged = mrt.render(scene, spp=2048, seed=99, **options).image
     error = np.sqrt(np.square(mean.image - converged).mean())

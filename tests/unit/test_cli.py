@@ -190,3 +190,5 @@ def test_every_option_arrives_at_the_render_or_is_the_commands_own():
     assert set(options.parse(["o"]).render_arguments()) <= set(inspect.signature(api.render).parameters)
     arguments = options.parse(["o", "layers=depth", "motion=1,2,3", "memory=4G"]).render_arguments()
     assert json.loads(json.dumps(arguments))["motion"] == [1, 2, 3]  # they go into the header as JSON
+    of_xml = options.parse(["o", "scene=a.xml", "target=1%", "fov=40"])  # a target is no point to look at
+    assert (str(of_xml.error), of_xml.params) == ("1%", {"fov": "40"})
