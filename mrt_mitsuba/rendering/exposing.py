@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 Values = list[Any]  # of rays, by channel: mi.Float, in scalar variants np.ndarray
 FILM_PREFIX = "film:"  # of the names of channels of the film and the integrator, which are no layers
-WAVEFRONT = 2**19  # rays of the first wavefront of a pass; later ones take QUICK to SLOW seconds each
+WAVEFRONT = 2**20  # rays of the first wavefront; later ones take QUICK to SLOW seconds each
 QUICK, SLOW = 0.25, 1.0
 
 
@@ -264,6 +264,7 @@ class Exposer:
         self.film: Any = film  #: None for a lattice
         self.film_channels = [*"RGB", *"A" * film.alpha, *film.bands, *shader.aovs] if film else []
         self.names = list(self.film_channels)
+        self._wavefront = WAVEFRONT  # rays of the next one
         self.planes: dict[str, slice] = {}
         known = ("image", "square") if film else ()  # to a film by itself
         for name, layer in TABLE.items():
@@ -343,13 +344,13 @@ class Exposer:
         """
         width = self.film.width if self.film else self.shader.width
         most = self.job.workspace.wavefront_size(channels)
-        rays = min(most, WAVEFRONT)
+        self._wavefront = min(most, self._wavefront)
         # the random numbers of Mitsuba's samplers depend on the cuts, which time must not decide
         timed = self.film is None or self.film.independent
         start = time.perf_counter()
 
         def limit() -> int:
-            return max(1, rays // groups.size)
+            return max(1, self._wavefront // groups.size)
 
         for part, some in groups.parts(limit, width):
             deliver_pending()
@@ -372,9 +373,9 @@ class Exposer:
             seconds = time.perf_counter() - start
             start += seconds
             if timed and seconds < QUICK:
-                rays = min(2 * rays, most)
+                self._wavefront = min(2 * self._wavefront, most)
             elif timed and seconds > SLOW:
-                rays = max(rays // 2, min(rays, WAVEFRONT))
+                self._wavefront = max(self._wavefront // 2, min(self._wavefront, WAVEFRONT))
 
     def _one_by_one(self, groups: RayBatch, samples: Samples) -> tuple[np.ndarray, Values]:
         """Trace rays in a loop in Python, for scalar variants."""
