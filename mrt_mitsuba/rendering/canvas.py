@@ -22,8 +22,9 @@ class Canvas:
 
     Rays lie in memory by the pixel in which they start. Each pixel adds up its own rays, once for every pixel
     that the filter reaches from it; then each pixel adds up what reaches it. Both have the same order every
-    time. The former sums are formed in single precision, the latter in double, so that pictures are the same
-    wherever wavefronts are cut between rows.
+    time; a scatter, as in Mitsuba's ``ImageBlock``, has that of threads, and other bits in most runs. The
+    former sums are formed in single precision, the latter in double, so that pictures are the same wherever
+    wavefronts are cut between rows.
 
     ``sums`` [channels, pictures, H, W] has filtered values times their weights, ``weights`` [pictures, H, W]
     these. With ``moments``, ``total`` and ``square`` [3, pictures, H, W] have the colours of the rays in each
