@@ -1,4 +1,4 @@
-"""Findings of a study while it runs: bounds, goals, tables, figures.
+"""Findings of a study while it runs: bounds, tables, figures.
 
 A study is a module with ``TITLE`` and ``run(study, *, quick)``, which states findings through its ``Study``;
 ``page`` shows them.
@@ -21,27 +21,17 @@ Values = dict[str, Any]  # by name: a row of a table, options, what describes a 
 Item = TypeVar("Item")
 
 
-@dataclass(frozen=True)
 class Bound(Measurement):
-    """A figure and the limit it is held to; one with an ``interval`` is a goal, open within it."""
-
-    interval: Sequence[float] | None = field(default=None, kw_only=True)
+    """A figure and the limit it is held to."""
 
     def __str__(self) -> str:
-        return f"{self.verdict:<6} {self.name}: {self.measured:.4g} {self.sign} {self.limit:.4g}"
-
-    @property
-    def verdict(self) -> str:
-        """One word: ok or MISSED; for a goal "goal" (reached), slower or open."""
-        if self.interval is None:
-            return "ok" if self.holds else "MISSED"
-        low, high = self.interval
-        return "goal" if high <= self.limit else "slower" if low > self.limit else "open"
+        mark = "ok" if self.holds else "MISSED"
+        return f"{mark:<6} {self.name}: {self.measured:.4g} {self.sign} {self.limit:.4g}"
 
     def as_dict(self) -> Values:
         """Return the values of ``summary.json``."""
         figures = {"measured": self.measured, "limit": self.limit, "sense": self.sign}
-        return {"name": self.name, **figures, "holds": self.holds, "verdict": self.verdict, "note": self.note}
+        return {"name": self.name, **figures, "holds": self.holds, "note": self.note}
 
 
 @dataclass
@@ -55,7 +45,6 @@ class Study:
     tables: dict[str, Values] = field(default_factory=dict)  # title, columns, rows, note, first
     images: dict[str, Values] = field(default_factory=dict)  # title, content, caption
     bounds: list[Bound] = field(default_factory=list)
-    goals: list[Bound] = field(default_factory=list)  # of speed: shown, but the verdict ignores them
     seconds: float = 0.0  # that it took
     failure: str = ""  # the traceback where it broke off
 
@@ -77,7 +66,7 @@ class Study:
 
     def __str__(self) -> str:
         lines = [f"{self.name}: {self.title} - {self.verdict.upper()} in {self.seconds:.1f} s"]
-        lines += [f"  {bound}" for bound in (*self.bounds, *self.goals)]
+        lines += [f"  {bound}" for bound in self.bounds]
         return "\n".join([*lines, *([f"  FAILED {self.failure.splitlines()[-1]}"] if self.failure else [])])
 
     def at_most(self, name: str, measured: float, limit: float, note: str) -> None:
@@ -87,10 +76,6 @@ class Study:
     def at_least(self, name: str, measured: float, limit: float, note: str) -> None:
         """Hold a figure to a lower bound; ``note``: why it is this one."""
         self.bounds.append(Bound(name, float(measured), float(limit), False, note))
-
-    def goal(self, name: str, measured: float, limit: float, note: str, *, interval: Sequence[float]) -> None:
-        """Show whether a time or a ratio of times is within a limit; a busy machine must fail no study."""
-        self.goals.append(Bound(name, float(measured), float(limit), note=note, interval=interval))
 
     def records(
         self,
@@ -134,7 +119,6 @@ class Study:
         found = {
             "title": self.title,
             "bounds": [bound.as_dict() for bound in self.bounds],
-            "goals": [goal.as_dict() for goal in self.goals],
             "tables": self.tables,
             "passed": self.passed,
             "verdict": self.verdict,
