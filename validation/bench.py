@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
+import timeit
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -102,17 +102,11 @@ CASES |= {
 
 
 def seconds(case: Case) -> float:
-    """Return the mean seconds of warm runs of a case, over half a second or one run."""
+    """Return the mean seconds of warm runs of a case, over 0.2 s or one run."""
     run = case()
     for _ in range(3):
         run()
-    number = 0
-    taken = 0.0
-    start = time.perf_counter()
-    while taken < 0.5:
-        run()
-        number += 1
-        taken = time.perf_counter() - start
+    number, taken = timeit.Timer(run).autorange()
     return taken / number
 
 

@@ -10,27 +10,27 @@ import time
 import traceback
 import warnings
 from collections.abc import Sequence
-from importlib import import_module, util
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mrt_mitsuba import __version__
-from mrt_mitsuba.errors import MrtError
+from mrt_mitsuba.errors import MrtError, needs_extra
 from mrt_mitsuba.rendering.progress import TerminalProgress
 
 if TYPE_CHECKING:
     from mrt_mitsuba.validation.study import Study
 
-# By name, which is that of a module: what --list says of it; seconds of a quick and of a full run on two idle
-# cores, about
+# By name, which is that of a module: what --list says of it; how long a quick and a full run take, about, on
+# two idle cores
 STUDIES = {
-    "roughconductor": ("is the material the function that Mitsuba's is", 10, 90),
-    "stock": ("are light, gloss and mirrors what Mitsuba computes", 15, 60),
-    "scenes": ("are the report's scenes right, with a reason for each pixel off", 10, 60),
-    "adaptive": ("what does an error cost next to the best sampler", 90, 1500),
-    "stability": ("where must float32 give out, and where does it not", 16, 150),
-    "error-vs-time": ("what does each setting buy for its time", 9, 1200),
-    "needs": ("what do scenes not need, and what would it cost", 9, 60),
+    "roughconductor": ("is the material the function that Mitsuba's is", "10 s", "90 s"),
+    "stock": ("are light, gloss and mirrors what Mitsuba computes", "15 s", "60 s"),
+    "scenes": ("are the report's scenes right, with a reason for each pixel off", "10 s", "60 s"),
+    "adaptive": ("what does an error cost next to the best sampler", "90 s", "25 min"),
+    "stability": ("where must float32 give out, and where does it not", "16 s", "2 min"),
+    "error-vs-time": ("what does each setting buy for its time", "9 s", "20 min"),
+    "needs": ("what do scenes not need, and what would it cost", "9 s", "60 s"),
 }
 EXTRAS = ("matplotlib", "jinja2", "scipy", "mpmath", "flip_evaluator")
 INTERRUPTED = 128 + signal.SIGINT
@@ -75,15 +75,14 @@ def run_studies(names: Sequence[str], out: Path, *, quick: bool, ablate: bool = 
 
     What a study raises becomes its failure. Raises ``MrtError``.
     """
-    if missing := " ".join(name.replace("_", "-") for name in EXTRAS if util.find_spec(name) is None):
-        raise MrtError(f"{missing} missing: {sys.executable} -m pip install {missing}")
+    with needs_extra():
+        for name in EXTRAS:
+            import_module(name)
     # Not before: NumPy needs a working folder under some Pythons
     from mrt_mitsuba.validation.page import prepare_folder, save_report
     from mrt_mitsuba.validation.study import Study
 
     prepare_folder(out)
-    seconds = sum(STUDIES[name][1] if quick else STUDIES[name][2] for name in names)
-    print(f"This takes about {_spoken(seconds)} on two idle cores.", file=sys.stderr)
     studies = []
     for name in names:
         study = Study(name, name, TerminalProgress(unit="step"))
@@ -107,7 +106,8 @@ def run_study(study: Study, *, quick: bool, ablate: bool = False) -> None:
         name = "ablation" if ablate and study.name == "adaptive" else study.name.replace("-", "_")
         module = import_module(f"mrt_mitsuba.validation.studies.{name}")
         study.title = module.TITLE
-        print(f"{study.name}: {study.title} ...", file=sys.stderr, flush=True)
+        took = STUDIES[study.name][1 if quick else 2]
+        print(f"{study.name}: {study.title}: about {took} ...", file=sys.stderr, flush=True)
         module.run(study, quick=quick)
     except Exception:
         study.failure = traceback.format_exc(limit=-4)
@@ -120,12 +120,8 @@ def listing() -> str:
     """Return a line on each study, with how long it takes on two idle cores."""
     lines = [f"  {'':<15}{'quick':>7}{'full':>8}"]
     for name, (about, quick, full) in STUDIES.items():
-        lines.append(f"  {name:<15}{_spoken(quick):>7}{_spoken(full):>8}  {about}")
+        lines.append(f"  {name:<15}{quick:>7}{full:>8}  {about}")
     return "\n".join(lines)
-
-
-def _spoken(seconds: int) -> str:
-    return f"{seconds} s" if seconds < 100 else f"{round(seconds / 60)} min"
 
 
 def _say(message: object) -> None:
