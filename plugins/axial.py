@@ -13,7 +13,8 @@ import numpy as np
 from .intersect import Frame
 from .mesh_api import Placement, keep_apart, write_buffers
 from .parameters import ParameterError, flag, number, segments, vector
-from .quadric_kinds import KINDS, QuadricTable
+from .quadric_kinds import KINDS
+from .quadric_table import QuadricTable
 from .variants import first, is_jit, updatable
 
 

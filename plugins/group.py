@@ -7,7 +7,8 @@ import numpy as np
 
 from .mesh_api import Placement, keep_apart, write_buffers
 from .parameters import ParameterError, bitmap, choice, segments
-from .quadric_kinds import CLOSED, KINDS, QuadricTable
+from .quadric_kinds import CLOSED, KINDS
+from .quadric_table import QuadricTable
 
 
 class MrtGroup(mi.Mesh):
@@ -20,9 +21,9 @@ class MrtGroup(mi.Mesh):
     =============== ========== ========== ==============================================================
     name            type       default    unit or range
     =============== ========== ========== ==============================================================
-    ``kind``        string     sphere     ``sphere``, ``cone`` or ``cylinder`` (closed)
-    ``numbers``     ``Bitmap`` required   float32 [n, 4] for spheres: centre, radius; [n, 7] for cones: apex,
-                                          base centre, radius; for cylinders: p0, p1, radius
+    ``kind``        string     sphere     ``sphere``, ``cone``, ... (closed): mrt_ and the kind is a plugin
+    ``numbers``     ``Bitmap`` required   float32 [n, 4] for spheres: centre, radius; [n, 7] for others: both
+                                          points as the plugin of the kind names them, radius
     ``face_NAME``   ``Bitmap``            float32 [n, 1 or 3], values of the objects that a ``mesh_attribute``
                                           texture of this name looks up
     ``to_world``    transform  identity   any invertible affine transform of all objects

@@ -1,8 +1,11 @@
-"""The kinds of quadrics that ``mrt_whitted`` traces exactly, as pure functions, and their table.
+"""The kinds of quadrics that ``mrt_whitted`` traces exactly, as pure functions: a row of ``KINDS`` each.
 
 Everything works in float32 and float64, on scalars, Dr.Jit arrays and lists of columns alike (see
 ``intersect``). The numbers of a quadric are those of its points, as many as ``points``, and a radius.
-``parts`` are those of its surface, ``ends`` the shapes at both ends of its axis.
+
+A quadric is intersected in its unit frame, to which a ``Frame`` maps world space: a solid of revolution lies
+between z = 0 and z = 1, where its radius is 1; a sphere of radius 1 around 0. The map is affine, so it
+changes neither t nor what is hit, and sizes, aspect ratios and shears are gone before anything is squared.
 """
 
 from __future__ import annotations
@@ -10,16 +13,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from typing import Any
 
 import drjit as dr
-import drjit.scalar
 import numpy as np
 
-from .intersect import BASE, LATERAL, TOP, Frame, intersect_cone, intersect_cylinder, intersect_sphere
+from .intersect import TINY, Frame, intersect_sphere, off_zero
 
-# The shapes at the ends of a quadric, by the squares of their semi-axes in the unit frame
+LATERAL, BASE, TOP = 0, 1, 2
+"""Parts of a surface: the curved side, the disc at z = 1, the disc at z = 0 (of a cylinder)."""
+
+# Ellipsoids around both ends of the axis, by the squares of their semi-axes in the unit frame
 POINT = (0, 0, 0)
 DISC = (1, 1, 0)
 BALL = (1, 1, 1)
@@ -28,13 +32,14 @@ BALL = (1, 1, 1)
 # [m, 3], counter-clockwise seen from outside in a right-handed frame
 UnitMesh = tuple[np.ndarray, np.ndarray]
 
+MAX_RINGS = 256  # of the mesh of a curved side
+
 
 class Sphere:
     """A sphere of radius 1 around 0."""
 
     points = 1
-    parts = (LATERAL,)
-    ends = (BALL, BALL)
+    hull = (BALL, BALL)
     closed = True
 
     def frame(self, center, radius) -> Frame:
@@ -56,10 +61,11 @@ class Sphere:
     def surface(self, p, part, frame: Frame):
         """Put a point near the sphere onto it, along the normal.
 
-        Returns the point, the outward unit normal and the texture coordinates:
-        u = azimuth / 2π in [0, 1), v = angle to +z over π, as in Mitsuba's ``sphere``.
+        Returns the point, the outward unit normal, the texture coordinates u = azimuth / 2π in [0, 1) and
+        v = angle to +z over π, as in Mitsuba's ``sphere``, and the derivatives by both in the unit frame.
         """
         q = frame.point(p)
+        make = type(q)
         r = dr.norm(q)
         at_center = r == 0
         gradient = q * (1 / dr.select(at_center, 1, r))
@@ -67,16 +73,10 @@ class Sphere:
         inverse = 1 / dr.select(at_center, 1, dr.norm(g))
         n = g * inverse
         v = dr.acos(dr.clip(gradient.z, -1, 1)) / dr.pi
-        return p - n * ((r - 1) * inverse), n, _turn(q), v
-
-    def derivatives(self, q, part):
-        """Return derivatives by u and v of a surface point ``q``, both in the unit frame."""
-        r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
-        x, y = _azimuth(q, r)
-        make = type(q)
+        across, x, y = _polar(q)
         around = make([-2 * dr.pi * q.y, 2 * dr.pi * q.x, 0 * q.x])
-        along = make([q.z * x, q.z * y, -r])
-        return around, along * dr.pi
+        along = make([q.z * x, q.z * y, -across]) * dr.pi
+        return p - n * ((r - 1) * inverse), n, _turn(q), v, around, along
 
     def mesh(self, segments: int = 0) -> UnitMesh:
         """Return an octahedron, whatever ``segments``."""
@@ -91,31 +91,32 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Axial:
-    """A solid of revolution along z from 0 to 1, with a radius of 1 at z = 1: a side, and discs at its ends.
-
-    Its side is straight: its radius grows by ``slope``, 0 or 1, and the hull of both ``ends`` bounds it. A
-    kind with another profile overrides ``surface`` and ``derivatives``, and has ends whose hull contains it.
+    """A convex solid of revolution along z from 0 to 1: a side, and a disc at each end that is no apex.
 
     Texture coordinates: u = azimuth / 2π in [0, 1), v = 1 - z on the side, the unit square around a disc.
     """
 
-    first_hit: Callable  # of a ray in world space, as ``intersect_cone`` gives it
-    side: Callable[[int], UnitMesh]  # the mesh of the side, from the number of segments
-    slope: int  # how much the radius of the side grows from z = 0 to z = 1
-    parts: tuple[int, ...]
-    ends: tuple[tuple[int, ...], tuple[int, ...]]
+    #: the interval [near, far] of s in which a line p + s u is inside the endless quadric, and whether there
+    #: is one; |u| = 1, p · u = 0
+    interval: Callable
+    #: of distance r from the axis and z: a function that is 0 on the side and < 0 inside, and its derivatives
+    side: Callable
+    outline: Callable  # z and radius, from an end of the side (0) to the other (1)
+    hull: tuple[tuple[float, ...], ...]  # ellipsoids at both ends in whose convex hull it is
+    curved: bool = False  # the outline is no straight line
     closed: bool = True  # with discs
 
     points = 2
 
-    def intersect(self, o, d, frame: Frame):
-        """Return t > 0 of the first hit in units of |d|, inf for a miss, and the part that is hit."""
-        return self.first_hit(o, d, frame, capped=self.closed)
+    @property
+    def apex(self) -> bool:
+        """Whether the side ends in a point at z = 0."""
+        return self.outline(0.0)[1] == 0
 
-    def mesh(self, segments: int) -> UnitMesh:
-        """Return the side, and the discs of a closed one."""
-        ends = enumerate(self.ends) if self.closed else ()
-        return _join(self.side(segments), *(_disc(segments, z) for z, end in ends if end == DISC))
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """The parts of the surface of a closed one."""
+        return (LATERAL, BASE) if self.apex else (LATERAL, BASE, TOP)
 
     def frame(self, p0, p1, radius) -> Frame:
         """Return the frame whose z runs from p0 to p1; seen against it, u grows counter-clockwise.
@@ -133,64 +134,153 @@ class Axial:
         t = make([b, sign + n.y * n.y * a, -n.y])
         return Frame(p0, s / radius, t / radius, axis / length2)
 
+    def intersect(self, o, d, frame: Frame):
+        """Return t > 0 of the first hit in units of |d|, inf for a miss, and the part that is hit.
+
+        Seen from inside, the far side is met. The solid is convex: a line is inside it for one interval. It
+        is cut out of that inside the endless quadric by the slab between the discs, so no ray slips through
+        between two surfaces, at a rim or an apex.
+        """
+        p, u, t_of = _line(frame.point(o), frame.vector(d))
+        near, far, inside = self.interval(p, u)
+        down = u.z > 0
+        to_base = (1 - p.z) / off_zero(u.z)
+        # At an apex, the side is the end
+        to_top = dr.select(down, -dr.inf, dr.inf) if self.apex else -p.z / off_zero(u.z)
+        level = u.z == 0
+        inside = inside & dr.select(level, (p.z >= 0) & (p.z <= 1), True)
+        enter = dr.select(level, -dr.inf, dr.minimum(to_top, to_base))
+        leave = dr.select(level, dr.inf, dr.maximum(to_top, to_base))
+        near_part = dr.select(enter > near, dr.select(down, TOP, BASE), LATERAL)
+        far_part = dr.select(leave < far, dr.select(down, BASE, TOP), LATERAL)
+        near = dr.maximum(near, enter)
+        far = dr.minimum(far, leave)
+        inside = inside & (near <= far)
+        near_t = t_of(near)
+        far_t = t_of(far)
+        if not self.closed:
+            near_t = dr.select(near_part == LATERAL, near_t, -dr.inf)
+            far_t = dr.select(far_part == LATERAL, far_t, -dr.inf)
+        from_outside = near_t > 0
+        t = dr.select(from_outside, near_t, far_t)
+        part = dr.select(from_outside, near_part, far_part)
+        return dr.select(inside & (t > 0), t, dr.inf), part
+
     def surface(self, p, part, frame: Frame):
         """Put a point near the given part onto it by a Newton step along the normal.
 
-        ``frame``: to the quadric's own coordinates. Returns (point, outward unit normal, u, v). At an apex
-        the normal is that of one of the generatrices.
+        ``frame``: to the quadric's own coordinates. Returns (point, outward unit normal, u, v), and the
+        derivatives by u and v in the unit frame. At the apex of a cone the normal is that of one of the
+        generatrices.
         """
         q = frame.point(p)
-        r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
-        x, y = _azimuth(q, r)
+        make = type(q)
+        r, x, y = _polar(q)
         side = part == LATERAL
         on_base = part == BASE
-        # The distance to the part, linear along its gradient
+        off_side, by_r, by_z = self.side(r, q.z)
         off_disc = dr.select(on_base, q.z - 1, -q.z)
-        off_side = r - q.z if self.slope else r - 1
-        up = dr.select(side, -self.slope, dr.select(on_base, 1, -1))
-        gradient = type(q)([dr.select(side, x, 0), dr.select(side, y, 0), up])
-        g = frame.gradient(gradient)
+        up = dr.select(side, by_z, dr.select(on_base, 1, -1))
+        g = frame.gradient(make([dr.select(side, by_r * x, 0), dr.select(side, by_r * y, 0), up]))
         inverse = 1 / dr.norm(g)
         n = g * inverse
+        distance = dr.select(side, off_side, off_disc) * inverse
         u = dr.select(side, _turn(q), 0.5 + 0.5 * q.x)
         v = dr.select(side, 1 - q.z, 0.5 + 0.5 * q.y)
-        distance = dr.select(side, off_side, off_disc) * inverse
-        return p - n * distance, n, u, dr.clip(v, 0, 1)
+        narrowing = by_z / off_zero(by_r)  # of the radius, by v
+        around = make([dr.select(side, -2 * dr.pi * q.y, 2), dr.select(side, 2 * dr.pi * q.x, 0), 0 * q.x])
+        along = [dr.select(side, narrowing * x, 0), dr.select(side, narrowing * y, 2), dr.select(side, -1, 0)]
+        return p - n * distance, n, u, dr.clip(v, 0, 1), around, make(along)
 
-    def derivatives(self, q, part):
-        """Return derivatives by u and v of a surface point ``q``, both in the unit frame."""
-        side = part == LATERAL
-        zero = 0 * q.x
-        r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
-        x, y = _azimuth(q, r)
-        around = -2 * dr.pi * q.y, 2 * dr.pi * q.x, zero
-        along = -self.slope * x, -self.slope * y, -1 + zero
-        by_u = [dr.select(side, a, b) for a, b in zip(around, (2 + zero, zero, zero), strict=True)]
-        by_v = [dr.select(side, a, b) for a, b in zip(along, (zero, 2 + zero, zero), strict=True)]
-        return type(q)(by_u), type(q)(by_v)
-
-
-def fan(segments: int) -> UnitMesh:
-    """Return the side of a cone: a vertex and a normal at the apex for each triangle."""
-    azimuth = 2 * np.pi * np.arange(segments + 1) / segments
-    between = 0.5 * (azimuth[1:] + azimuth[:-1])
-    i = np.arange(segments)
-    faces = np.stack([i, i + segments + 1, i + 1], axis=1)
-    return np.concatenate([_ring(azimuth, 1, slope=1), _ring(between, 0, slope=1)]), faces
-
-
-def strip(segments: int) -> UnitMesh:
-    """Return the side of a cylinder: quads, each split in two."""
-    azimuth = 2 * np.pi * np.arange(segments + 1) / segments
-    i = np.arange(segments)
-    k = i + segments + 1
-    lower = np.stack([i, i + 1, k], axis=1)
-    upper = np.stack([i + 1, k + 1, k], axis=1)
-    return np.concatenate([_ring(azimuth, 0), _ring(azimuth, 1)]), np.concatenate([lower, upper])
+    def mesh(self, segments: int) -> UnitMesh:
+        """Return rings around the axis, joined by triangles, and the discs of a closed one as fans."""
+        steps = min(segments // 2, MAX_RINGS) if self.curved else 1
+        z, radius = self.outline(np.linspace(0, 1, steps + 1)[:, None])  # [rings, 1]
+        _, by_r, by_z = self.side(radius, z)
+        # At an apex, each triangle has a vertex and a normal of its own
+        turn = (np.arange(segments + 1) - 0.5 * (radius == 0)) / segments
+        x = np.cos(2 * np.pi * turn)
+        y = np.sin(2 * np.pi * turn)
+        columns = radius * x, radius * y, z, by_r * x, by_r * y, by_z, turn, 1 - z
+        vertices = np.stack(np.broadcast_arrays(*columns), axis=-1).reshape(-1, 8)
+        k = np.arange(len(vertices)).reshape(steps + 1, -1)
+        lower = np.stack([k[:-1, :-1], k[:-1, 1:], k[1:, :-1]], axis=-1)
+        upper = np.stack([k[1:, :-1], k[:-1, 1:], k[1:, 1:]], axis=-1)
+        faces = np.concatenate([lower[int(self.apex) :], upper]).reshape(-1, 3)
+        for end in self.parts[1:] if self.closed else ():
+            rim, fan = _disc(segments, end)
+            faces = np.concatenate([faces, fan + len(vertices)])
+            vertices = np.concatenate([vertices, rim])
+        return vertices, faces
 
 
-_CONE = Axial(intersect_cone, fan, slope=1, parts=(LATERAL, BASE), ends=(POINT, DISC))
-_CYLINDER = Axial(intersect_cylinder, strip, slope=0, parts=(LATERAL, BASE, TOP), ends=(DISC, DISC))
+def inside_cone(p, u):
+    """Return the interval of a line inside x² + y² = z², z >= 0, as ``Axial.interval``.
+
+    With ⟨a, b⟩ = a.x b.x + a.y b.y − a.z b.z, the surface is at the roots of ⟨u,u⟩ s² + 2⟨p,u⟩ s + ⟨p,p⟩.
+    Their discriminant is written as m.x² + m.y² − m.z² with the line's moment m = p × u (Lagrange's
+    identity), so that it is accurate relative to |p|², and p · u = 0 makes ⟨p,u⟩ = −2 p.z u.z.
+    """
+    rho = dr.sqrt(dr.square(u.x) + dr.square(u.y))
+    r = dr.sqrt(dr.square(p.x) + dr.square(p.y))
+    a = (rho - dr.abs(u.z)) * (rho + dr.abs(u.z))
+    half_b = -2 * p.z * u.z
+    c = (r - dr.abs(p.z)) * (r + dr.abs(p.z))
+    m_x = p.y * u.z - p.z * u.y
+    m_y = p.z * u.x - p.x * u.z
+    m_z = dr.abs(p.x * u.y - p.y * u.x)
+    m_xy = dr.sqrt(dr.square(m_x) + dr.square(m_y))
+    discriminant = (m_xy - m_z) * (m_xy + m_z)
+    first, second = roots(a, half_b, c, discriminant)
+    # Steeper than the side: the line is inside each half of the double cone once, up to or from infinity.
+    # Shallower: both roots are on the half on whose side of the apex p is
+    steep = a <= 0
+    down = u.z > 0
+    near = dr.select(steep, dr.select(down, second, -dr.inf), first)
+    far = dr.select(steep, dr.select(down, dr.inf, first), second)
+    return near, far, steep | ((discriminant >= 0) & (p.z > 0))
+
+
+def inside_cylinder(p, u):
+    """Return the interval of a line inside x² + y² = 1, as ``Axial.interval``.
+
+    As ``inside_cone``, for the form a.x b.x + a.y b.y: the discriminant is ρ² − (p × u).z², ρ² = u.x² + u.y².
+    """
+    rho = dr.sqrt(dr.square(u.x) + dr.square(u.y))
+    r = dr.sqrt(dr.square(p.x) + dr.square(p.y))
+    moment = dr.abs(p.x * u.y - p.y * u.x)
+    discriminant = (rho - moment) * (rho + moment)
+    first, second = roots(dr.square(rho), p.x * u.x + p.y * u.y, (r - 1) * (r + 1), discriminant)
+    along = rho == 0
+    near = dr.select(along, -dr.inf, first)
+    far = dr.select(along, dr.inf, second)
+    return near, far, dr.select(along, r <= 1, discriminant >= 0)
+
+
+def roots(a, half_b, c, discriminant):
+    """Return the roots of a s² + 2 half_b s + c in ascending order; where a vanishes, one of them is huge.
+
+    Source: the cancellation-free form, e.g. Press et al., Numerical Recipes, §5.6.
+    """
+    root = dr.sqrt(dr.maximum(discriminant, 0))
+    q = dr.select(half_b >= 0, -half_b - root, root - half_b)
+    one = q / dr.select(a == 0, -TINY, a)
+    other = c / off_zero(q)
+    return dr.minimum(one, other), dr.maximum(one, other)
+
+
+_CONE = Axial(
+    interval=inside_cone,
+    side=lambda r, z: (r - z, 1, -1),
+    outline=lambda s: (s, s),
+    hull=(POINT, DISC),
+)
+_CYLINDER = Axial(
+    interval=inside_cylinder,
+    side=lambda r, z: (r - 1, 1, 0),
+    outline=lambda s: (s, 1.0),
+    hull=(DISC, DISC),
+)
 
 KINDS: dict[str, Any] = {
     "sphere": Sphere(),
@@ -202,11 +292,12 @@ KINDS: dict[str, Any] = {
 CLOSED = tuple(name for name, kind in KINDS.items() if kind.closed)  #: those that a group may hold
 
 
-def _azimuth(q, r):
-    """Return cosine and sine of the azimuth of ``q`` at distance r from the axis; on the axis, those of 0."""
+def _polar(q):
+    """Return the distance of ``q`` from the axis, cosine and sine of its azimuth; on the axis, those of 0."""
+    r = dr.sqrt(dr.square(q.x) + dr.square(q.y))
     on_axis = r == 0
     inverse = 1 / dr.select(on_axis, 1, r)
-    return dr.select(on_axis, 1, q.x * inverse), q.y * inverse
+    return r, dr.select(on_axis, 1, q.x * inverse), q.y * inverse
 
 
 def _turn(q):
@@ -215,128 +306,29 @@ def _turn(q):
     return dr.select(azimuth < 0, azimuth + 1, azimuth)
 
 
-def _ring(azimuth: np.ndarray, z: int, *, slope: int = 0) -> np.ndarray:
-    """Return vertices around the axis, on a side whose radius is 1 at z = 1 and grows by ``slope``."""
-    x = np.cos(azimuth)
-    y = np.sin(azimuth)
-    one = np.ones_like(azimuth)
-    radius = 1 - slope * (1 - z)
-    u = azimuth / (2 * np.pi)
-    return np.stack([radius * x, radius * y, z * one, x, y, -slope * one, u, (1 - z) * one], axis=1)
+def _line(o, d):
+    """Return a ray's line in the unit frame: p, u of s ↦ p + s u with |u| = 1, p · u = 0; and t of s."""
+    length = dr.norm(d)
+    u = d / length
+    along = dr.dot(o, u)
+    p = type(d)(o) - u * along
+    rest = dr.dot(p, u)  # from far away, the rounding of the first step is not small against the shape
+
+    def t_of(s):
+        return (s - (along + rest)) / length
+
+    return p - u * rest, u, t_of
 
 
-def _disc(segments: int, z: int) -> UnitMesh:
+def _disc(segments: int, part: int) -> UnitMesh:
     """Return a fan around the centre, facing away from z = 1/2."""
     i = np.arange(segments)
-    rim = _ring(2 * np.pi * i / segments, z)
-    center = [0, 0, z, 0, 0, 0, 0, 0]
-    vertices = np.concatenate([rim, [center]])
-    vertices[:, 3:6] = 0, 0, 1 if z == 1 else -1
+    azimuth = 2 * np.pi * i / segments
+    vertices = np.zeros((segments + 1, 8))  # the centre comes last
+    vertices[:-1, 0] = np.cos(azimuth)
+    vertices[:-1, 1] = np.sin(azimuth)
+    vertices[:, 2] = 1 if part == BASE else 0
+    vertices[:, 5] = 1 if part == BASE else -1
     vertices[:, 6:] = 0.5 + 0.5 * vertices[:, :2]
     faces = np.stack([i, (i + 1) % segments, np.full_like(i, segments)], axis=1)
-    return vertices, faces if z == 1 else faces[:, ::-1]
-
-
-def _join(*parts: UnitMesh) -> UnitMesh:
-    first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
-    faces = [faces + start for (_, faces), start in zip(parts, first, strict=False)]
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
-
-
-class QuadricTable:
-    """Objects of one kind, by their unit frames, and the mesh that stands for each."""
-
-    def __init__(
-        self,
-        kind: str,
-        numbers: np.ndarray,
-        place: Callable[[Frame], Frame],
-        unit: UnitMesh,
-        *,
-        flipped: bool,
-    ) -> None:
-        """Read the ``numbers`` of the objects, float64 [n, width], and move each by ``place``.
-
-        ``unit``: the stand-in in the unit frame. ``flipped``: the normals point inwards.
-        """
-        points = [Columns.of(numbers[:, 3 * k : 3 * k + 3]) for k in range(KINDS[kind].points)]
-        frame = place(KINDS[kind].frame(*points, column(numbers[:, -1])))
-        self.kind = kind
-        self.unit = unit
-        self.flipped = flipped
-        self.origins = frame.origin.array()  # float64 [n, 3]
-        self.rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)  # [n, 3, 3]
-        #: the first face of each stand-in, int [n], for textures that are looked up by face
-        self.first_faces = len(unit[1]) * np.arange(len(numbers))
-
-    def boxes(self) -> np.ndarray:
-        """Return the bounding boxes [n, 2, 3]: of ellipsoids at both ends."""
-        columns = np.linalg.inv(self.rows)
-        kind = KINDS[self.kind]
-        half = np.stack([np.sqrt((columns**2 * end).sum(axis=2)) for end in kind.ends], axis=1)
-        axis = columns[:, :, 2] * (kind.points - 1)
-        centers = np.stack([self.origins, self.origins + axis], axis=1)  # [n, end, 3]
-        low = (centers - half).min(axis=1)
-        high = (centers + half).max(axis=1)
-        return np.stack([low, high], axis=1)
-
-    def numbers(self, kinds: list[str]) -> np.ndarray:
-        """Return the numbers that a kernel for such kinds reads of each object, [n, 4, 4]: four at a time.
-
-        A row and a coordinate of the origin, three times; kind, size of coordinates, 0, side of the normal.
-        """
-        numbers = np.zeros((len(self.rows), 4, 4))
-        numbers[:, :3, :3] = self.rows
-        numbers[:, :3, 3] = self.origins
-        numbers[:, 3, 0] = kinds.index(self.kind)
-        numbers[:, 3, 1] = np.abs(self.boxes()).max(axis=(1, 2))
-        numbers[:, 3, 3] = -1 if self.flipped else 1
-        return numbers
-
-    def proxy_mesh(self) -> dict[str, np.ndarray]:
-        """Return the buffers of a mesh of all objects; frames may be left-handed."""
-        columns = np.linalg.inv(self.rows).transpose(0, 2, 1)
-        vertices, faces = self.unit
-        positions = vertices[:, :3] @ columns + self.origins[:, None]
-        normals = vertices[:, 3:6] @ self.rows
-        normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-        faces = faces if np.linalg.det(self.rows[0]) > 0 else faces[:, ::-1]
-        first = len(vertices) * np.arange(len(self.rows))
-        every = faces[None] + first[:, None, None]  # [n, faces, 3]
-        return {
-            "faces": every.astype(np.uint32).ravel(),
-            "vertex_positions": positions.astype(np.float32).ravel(),
-            "vertex_normals": normals.astype(np.float32).ravel(),
-        }
-
-
-class Columns(list):
-    """Three columns, which Dr.Jit's ``dot``, ``norm`` and ``normalize`` take for a vector."""
-
-    x, y, z = (property(itemgetter(k)) for k in range(3))
-
-    @classmethod
-    def of(cls, array: np.ndarray) -> Columns:
-        """Return the float64 columns of an array [n, 3]."""
-        return cls(column(array[:, k]) for k in range(3))
-
-    def array(self) -> np.ndarray:
-        """Return the array [n, 3] of the columns."""
-        return np.stack([np.array(c) for c in self], axis=1)
-
-    def __add__(self, other) -> Columns:
-        return Columns(a + b for a, b in zip(self, other, strict=True))
-
-    def __sub__(self, other) -> Columns:
-        return Columns(a - b for a, b in zip(self, other, strict=True))
-
-    def __mul__(self, factor) -> Columns:
-        return Columns(a * factor for a in self)
-
-    def __truediv__(self, divisor) -> Columns:
-        return self * (1 / divisor)
-
-
-def column(values: np.ndarray):
-    """Return one column of float64 numbers."""
-    return drjit.scalar.ArrayXf64(np.ascontiguousarray(values, np.float64))
+    return vertices, faces if part == BASE else faces[:, ::-1]

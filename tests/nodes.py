@@ -10,11 +10,21 @@ import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.plugins import class_of
-from mrt_mitsuba.plugins.table import Plugin
+from mrt_mitsuba.plugins.table import PLUGINS, Plugin
+from mrt_mitsuba.scene.model import OBJECTS
+from mrt_mitsuba.validation.oracles.reference import PROFILES
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
 SENSOR = "<sensor type='perspective'><film type='hdrfilm'>{}</film></sensor>"
 SMALL = SENSOR.format("<integer name='width' value='4'/><integer name='height' value='3'/>")
+
+AXIAL = [row for row in PLUGINS if row.module == "axial"]  # quadrics between two points
+
+
+def radius(kind: str, z: Any) -> Any:
+    """The radius of the side of such a quadric in its unit frame, as the float64 tracer has it."""
+    flat, linear, square = PROFILES[OBJECTS[kind]]
+    return (flat + linear * z + square * z**2) ** 0.5
 
 
 def scene_xml(inside: str, sensor: str = SMALL) -> str:

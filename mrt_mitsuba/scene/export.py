@@ -14,7 +14,7 @@ from mrt_mitsuba.scene.loading import load_file
 from mrt_mitsuba.scene.model import FLAVORS, SIZE, Node, Scene
 from mrt_mitsuba.scene.open import in_terms
 from mrt_mitsuba.scene.report import report_scene, scene_dict
-from mrt_mitsuba.scene.stock import stock
+from mrt_mitsuba.scene.stock import STOCK_SHAPES, stock
 
 
 def write_xml(
@@ -92,7 +92,8 @@ def _put_into_files(nodes: Node, stem: str, flavor: str) -> dict[str, bytes]:
                 f"{name} cannot be written as XML: mrt_group is made of arrays; render it from Python, or "
                 "write at most 1000 spheres or 100 objects of another kind"
             )
-        if kind == "mrt_mesh" or (kind == "mrt_cone" and flavor == "stock"):
+        without_stock = flavor == "stock" and "bsdf" in node and kind not in STOCK_SHAPES
+        if kind == "mrt_mesh" or without_stock:
             file = f"{stem}_{name}.ply"
             bsdf = node.pop("bsdf")
             stream = mi.MemoryStream()

@@ -169,7 +169,8 @@ class Scene:
             return {"type": "ref", "id": names.setdefault(material, f"material_{len(names)}")}
 
         shapes: Node = {}
-        for kind, plugin in PLUGINS.items():
+        for kind in OBJECTS:
+            plugin = "sphere" if kind == "sphere" else f"mrt_{kind}"
             single = getattr(self, f"{kind}s")
             grouped = []
             if len(single) > MAX_SINGLE.get(kind, math.inf):
@@ -198,11 +199,12 @@ class Scene:
         return result | shapes
 
 
-# The plugins of objects; all fields except the material, which comes last, are their parameters
-PLUGINS = {"sphere": "sphere", "cone": "mrt_cone", "cylinder": "mrt_cylinder", "plane": "mrt_plane"}
+# Kinds of objects: each has a field of ``Scene``, with an s, and a plugin, mrt_ and its name, or Mitsuba's
+# sphere. All fields of the class except the material, which comes last, are parameters of the plugin
+OBJECTS: dict[str, type] = {"sphere": Sphere, "cone": Cone, "cylinder": Cylinder, "plane": Plane}
 # Maximum number of single shapes of a kind; more make one shape: Mitsuba takes 0.1 ms to load a native shape
 # and over 1 ms for one in Python, each inside the one before, up to Python's limit of recursion
-MAX_SINGLE = {"sphere": 1000, "cone": 100, "cylinder": 100}
+MAX_SINGLE = {kind: 1000 if kind == "sphere" else 100 for kind in OBJECTS if kind != "plane"}
 
 
 def _all_finite(values: Sequence[float], count: int) -> bool:

@@ -18,22 +18,19 @@ from mrt_mitsuba.options import check, choice
 from mrt_mitsuba.scene.model import (
     FLAVORS,
     FRESNEL,
+    OBJECTS,
     SIDE,
     Camera,
-    Cone,
-    Cylinder,
     Light,
     Material,
     Mesh,
     Node,
-    Plane,
     Scene,
     Sphere,
 )
 
 NUMBERS = tuple(range(10))
 _ASSETS = Path(__file__).parent / "assets"
-_KINDS = {"spheres": Sphere, "planes": Plane, "cones": Cone, "cylinders": Cylinder}
 
 
 def report_scene(number: int) -> Scene:
@@ -77,7 +74,8 @@ def _read(number: int) -> Scene:
     table = _tuples(json.loads((_ASSETS / "scenes.json").read_text(encoding="utf-8")))["scenes"][number]
     materials = {name: Material(*values) for name, values in table["materials"].items()}
     objects: dict[str, Any] = {
-        kind: tuple(_object(kind, materials, *row) for row in table.get(kind, ())) for kind in _KINDS
+        f"{kind}s": tuple(_object(make, materials, *row) for row in table.get(f"{kind}s", ()))
+        for kind, make in OBJECTS.items()
     }
     if "random_spheres" in table:
         objects["spheres"] = tuple(_random_spheres(table["random_spheres"], [*materials.values()]))
@@ -100,13 +98,13 @@ def _tuples(value: Any) -> Any:
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
-def _object(kind: str, materials: Mapping[str, Material], *row: Any) -> Any:
+def _object(make: type, materials: Mapping[str, Material], *row: Any) -> Any:
     """Make an object of a row: its numbers, the name of its material, and perhaps what of that differs."""
     changes: dict[str, Any] = {}
     if isinstance(row[-1], dict):
         *row, changes = row  # type: ignore[assignment]
     *numbers, name = row
-    return _KINDS[kind](*numbers, replace(materials[name], **changes))
+    return make(*numbers, replace(materials[name], **changes))
 
 
 def _random_spheres(number: int, materials: list[Material]) -> Iterator[Sphere]:

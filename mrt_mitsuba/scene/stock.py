@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 # The finite stand-in of a plane, scene units: beyond, float32 makes its intersections visibly wrong
 STOCK_EXTENT = 100.0
 
+STOCK_SHAPES = ("sphere", "mrt_plane", "mrt_cylinder")  # all that have a counterpart
+
 
 def stock(nodes: Node, scene: Scene) -> Node:
     """Replace every plugin of this project by its nearest stock equivalent, which may take several nodes."""
@@ -44,7 +46,7 @@ def stock(nodes: Node, scene: Scene) -> Node:
         elif kind.startswith("mrt_"):
             raise SceneError(
                 f"{name} has no counterpart among Mitsuba's plugins: {kind} is made of arrays, or a mesh to "
-                "them; write_xml, or mrt export, writes meshes and cones into files"
+                "them; write_xml, or mrt export, writes it into a file"
             )
     return result
 

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..intersect import LATERAL, Frame
-from ..quadric_kinds import KINDS
+from ..intersect import Frame
+from ..quadric_kinds import KINDS, LATERAL
 from ..variants import is_jit, put_where
 from .tables import Table, shape_at, shape_ids
 from .tree import Tree
@@ -114,12 +114,11 @@ class Quadrics:
         if self.moving:
             # The hit goes along the ray as the surface moves
             met = ray.o + ray.d * t
-            p, n, _, _ = self._by_kind(kind, "surface", met, part, frame)
+            p, n, *_ = self._by_kind(kind, "surface", met, part, frame)
             t = dr.replace_grad(t, t + dr.dot(p - met, n) / dr.dot(ray.d, n))
-        p, n, u, v = self._by_kind(kind, "surface", dr.fma(ray.d, t, ray.o), part, frame)
+        p, n, u, v, by_u, by_v = self._by_kind(kind, "surface", dr.fma(ray.d, t, ray.o), part, frame)
         more = {}
         if tangents:
-            by_u, by_v = self._by_kind(kind, "derivatives", frame.point(p), part)
             more = {"dp_du": frame.to_world(by_u), "dp_dv": frame.to_world(by_v)}
         if self.flipped:
             n *= side

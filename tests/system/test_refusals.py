@@ -18,6 +18,7 @@ from nodes import SENSOR, SMALL, TRIANGLE, scene_xml
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command import main as cli
+from mrt_mitsuba.plugins.quadric_kinds import CLOSED
 from mrt_mitsuba.runtime import obstacle
 from mrt_mitsuba.scene.model import BLUE_SKY, Camera, Cone, Material, Mesh, Scene, Sphere
 
@@ -372,7 +373,7 @@ spoilt("mrt_group", '"numbers" must be a mi.Bitmap')
 balls("3 numbers for an object, but must have 4", numbers=ONE[:, :3])
 balls("axis of no length", numbers=NO_AXIS, kind="cone")
 balls("has 2 rows for 1 objects", face_x=TWO_ROWS)
-balls("sphere, cone, cylinder", kind="cube")
+balls(", ".join(CLOSED), kind="cube")
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"], indirect=True)

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cases import but_slow
+from nodes import AXIAL
 from unit.specimens import exceeded
 
 import mrt_mitsuba as mrt
@@ -24,7 +25,6 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 OPEN = {"watertight"}
 MIRRORED = {"to_world": [1, -1, 1]}
-CONE = {"apex": [0, 1, 0], "base_center": [0, 0, 0], "radius": 0.5, **MIRRORED}
 ELLIPSOIDS = {
     "centers": np.float32([[0, 0, 0], [2, 0, 0]]),
     "scales": np.float32([[0.3, 0.2, 0.4], [0.1, 0.3, 0.2]]),
@@ -40,9 +40,9 @@ SHAPES: dict[str, tuple[dict[str, Any], set[str], set[str]]] = {
     "cylinder": ({}, {"far"}, OPEN),
     "ellipsoidsmesh": (ELLIPSOIDS, {"watertight"}, {"scale"}),
     "mrt_plane": ({"normal": [0, 1, 0]}, set(), OPEN | {"scale"}),
-    "mrt_cone": (CONE, {"far"}, set()),
-    "mrt_cylinder": ({"p0": [0, 1, 0], "p1": [0, 0, 0], "radius": 0.5, **MIRRORED}, {"far"}, set()),
 }
+for row in AXIAL:
+    SHAPES[row.name] = ({**row.sample, "radius": 0.5, **MIRRORED}, {"far"}, set())
 
 
 @pytest.mark.parametrize("name", but_slow(SHAPES, {"ellipsoidsmesh"}))

@@ -13,7 +13,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cases import Cases
-from nodes import group, rgb, sensor
+from nodes import AXIAL, group, radius, rgb, sensor
+
+from mrt_mitsuba.plugins.table import Plugin
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -102,10 +104,12 @@ def material(**change: Any) -> dict[str, Any]:
     return {"ball": {"type": "sphere", "bsdf": MATERIAL | change}}
 
 
-def exact_shape(kind: str, first: str, second: str, radius: float) -> Iterator[tuple]:
+def exact_shape(row: Plugin) -> tuple[str, float, dict[str, Any]]:
     """Its surface is exact: derivatives of a cone's mesh, which other integrators see, are a third off."""
-    ball = {"type": kind, first: [0, 4, 0], second: [0, -4, 0], "radius": radius, "segments": 8}
-    yield f"ball.radius ball.{first} ball.{second}", 1e-2, {"ball": {**ball, "bsdf": MATERIAL}}
+    first, second = row.sample
+    ball = {"type": row.name, first: [0, 4, 0], second: [0, -4, 0], "segments": 8}
+    ball["radius"] = 1 / radius(row.name.removeprefix("mrt_"), 0.5)  # 1 in the middle
+    return f"ball.radius ball.{first} ball.{second}", 1e-2, {"ball": {**ball, "bsdf": MATERIAL}}
 
 
 TEXTURE = {"type": "checkerboard", "color0": 0.2, "color1": 0.4}
@@ -122,11 +126,8 @@ slopes("ball.to_world", 1e-2, {})
 slopes("ball.bsdf.int_ior", 4e-3, material(fresnel="dielectric"))
 slopes("ball.bsdf.f0.value", 4e-3, material(f0=rgb(0.5, 0.4, 0.3)))
 slopes("ball.bsdf.alpha.color0.value", 4e-3, material(alpha=TEXTURE))
-for case in (
-    *exact_shape("mrt_cone", "apex", "base_center", 2.0),
-    *exact_shape("mrt_cylinder", "p0", "p1", 1.0),
-):
-    slopes(*case, slow=True)
+for row in AXIAL:
+    slopes(*exact_shape(row), slow=True)
 # Light that goes to and fro between the ball and a room of mirrors
 DEEP = {"type": "mrt_whitted", "max_depth": 6, "bounce_budget": "plain", "clamp": False}
 ROOM = {"type": "sphere", "radius": 20.0, "flip_normals": True}

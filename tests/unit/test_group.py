@@ -8,8 +8,9 @@ import pytest
 from nodes import group
 from numpy.testing import assert_allclose
 
+from mrt_mitsuba.plugins.quadric_kinds import CLOSED, KINDS
 from mrt_mitsuba.scene import model as scene
-from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.scene.model import OBJECTS, Camera, Light, Material, Plane, Scene, Sphere
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -21,9 +22,8 @@ def crowd(kind: str, count: int, materials: int) -> Scene:
     table = [Material(1 + ior, alpha, tuple(rest[:3]), tuple(rest[3:])) for ior, alpha, *rest in numbers]
     places = rng.uniform(-2, 2, (count, 3)) + np.array([0, 2.2, 0])
     ends = places + rng.normal(size=(count, 3)) * 0.3
-    make = {"sphere": Sphere, "cone": Cone, "cylinder": Cylinder}[kind]
-    points = places[None] if kind == "sphere" else np.stack([places, ends])
-    objects = tuple(make(*points[:, k].tolist(), 0.2, table[k % materials]) for k in range(count))
+    points = np.stack([places, ends])[: KINDS[kind].points]
+    objects = tuple(OBJECTS[kind](*points[:, k].tolist(), 0.2, table[k % materials]) for k in range(count))
     floor = Plane((0, 1, 0), 0, table[0])
     view = Camera((6, 4, 5), (0, 1.5, 0))
     sun = Light((3, 8, 1), (1.5, 1.5, 1.5))
@@ -34,7 +34,7 @@ def picture(content: Scene) -> np.ndarray:
     return np.array(mi.render(mi.load_dict(content.to_dict(width=120, height=90)), spp=1, seed=0))
 
 
-@pytest.mark.parametrize(("kind", "materials"), [("sphere", 1), ("sphere", 7), ("cone", 7), ("cylinder", 7)])
+@pytest.mark.parametrize(("kind", "materials"), [("sphere", 1), *((kind, 7) for kind in CLOSED)])
 def test_a_group_looks_like_its_members(monkeypatch, kind, materials):
     """Equal rays give equal pictures, but for roundings that move a silhouette or a shadow's edge."""
     content = crowd(kind, 40, materials)

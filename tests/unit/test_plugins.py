@@ -35,10 +35,8 @@ def drawn(scene: dict[str, Any]) -> np.ndarray:
 
 # Some that Mitsuba's own classes read, so that it does not report them as unused
 SHARED = ("to_world", "flip_normals", "face_normals", "hide_emitters", "to_uv", "bogus")
-USED = {
-    "mrt_cone": {"to_world", "flip_normals"},
-    "mrt_cylinder": {"to_world", "flip_normals"},
-    "mrt_group": {"to_world", "flip_normals"},
+USED = {row.name: {"to_world", "flip_normals"} for row in PLUGINS if row.table == "quadrics"}
+USED |= {
     "mrt_mesh": {"to_world", "flip_normals", "face_normals"},
     "mrt_plane": {"flip_normals", "face_normals"},
 }

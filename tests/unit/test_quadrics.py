@@ -12,13 +12,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cases import Cases
-from nodes import group, sensor
+from nodes import group, radius, sensor
 
 from mrt_mitsuba.plugins import intersect
-from mrt_mitsuba.plugins.intersect import BASE, LATERAL, TOP
-from mrt_mitsuba.plugins.quadric_kinds import CLOSED, KINDS
+from mrt_mitsuba.plugins.quadric_kinds import BASE, CLOSED, KINDS, LATERAL, TOP
 from mrt_mitsuba.plugins.whitted.quadrics import Quadrics
-from mrt_mitsuba.scene.model import Cone, Cylinder, Material
+from mrt_mitsuba.scene.model import OBJECTS, Material
 from mrt_mitsuba.validation.oracles import reference
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -86,11 +85,11 @@ def test_surface_points_have_their_normal_and_uv(kind):
     def off(part: int, q: Any) -> Any:
         """Distance above a part, in the unit frame."""
         if part == LATERAL:
-            return dr.sqrt(q.x**2 + q.y**2) - (q.z if kind == "cone" else 1)
+            return dr.sqrt(q.x**2 + q.y**2) - radius(kind, q.z)
         return q.z - 1 if part == BASE else -q.z
 
     for part in KINDS[kind].parts:
-        on, n, _, v = KINDS[kind].surface(p, part, frame)
+        on, n, _, v, *_ = KINDS[kind].surface(p, part, frame)
         q = frame.point(on)
         back = frame.point(on - n * 1e-6)
         other = ~(q.z > 0.05)  # above its apex a cone has another half
@@ -110,8 +109,7 @@ def test_stand_ins_are_wound_as_their_normals_point(kind):
 
 def nearest(kind: str, ends: np.ndarray, radii: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Distances [N] by the float64 tracer, in lengths of d."""
-    make = Cone if kind == "cone" else Cylinder
-    things = [make(*e.tolist(), float(r), MATTE) for e, r in zip(ends, radii, strict=True)]
+    things = [OBJECTS[kind](*e.tolist(), float(r), MATTE) for e, r in zip(ends, radii, strict=True)]
     length = np.linalg.norm(np.float64(d), axis=1)
     t, *_ = reference.nearest(things, np.float64(o), d / length[:, None])
     return t / length
@@ -131,17 +129,16 @@ def crowd(count: int, place: str, kind: str) -> tuple[np.ndarray, ...]:
     d[::7, 0] = 0
     d[::11, 1] = 0  # along planes of the axes, where box tests divide by nothing
     inner = ends[which].mean(axis=1)
-    radius = radii[which, None]
+    wide = radii[which, None]
     if place == "among":
         o = rng.uniform(-4, 4, (rays, 3))
     elif place == "inside":
-        o = inner + rng.normal(size=(rays, 3)) * 0.05 * radius
+        o = inner + rng.normal(size=(rays, 3)) * 0.05 * wide
     else:  # at the surface, a hundredth of the radius off it
         axis = end[which] - start[which]
         out = np.cross(axis, rng.normal(size=(rays, 3)))
         out /= np.linalg.norm(out, axis=1, keepdims=True)
-        half = 0.5 if kind == "cone" else 1.0
-        o = inner + out * radius * half * 1.01
+        o = inner + out * wide * radius(kind, 0.5) * 1.01
     return ends, radii, o, d
 
 

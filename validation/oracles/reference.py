@@ -12,13 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import singledispatch
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.linalg import norm
+from numpy.polynomial import Polynomial
 from PIL import Image
 
-from mrt_mitsuba.scene.model import Cone, Cylinder, Mesh, Plane, Scene, Sphere
+from mrt_mitsuba.scene.model import OBJECTS, Cone, Cylinder, Mesh, Plane, Scene, Sphere
 
 # Secondary rays start this far off the surface, relative to the coordinates and distances that led to the
 # point: far above the rounding of float64, far below anything a float32 picture can show
@@ -75,7 +77,7 @@ def reference_render(
 @np.errstate(all="ignore")
 def _radiance(scene: Scene, o: Array, d: Array, fresnel: str, clamp: bool) -> tuple[Array, Array]:
     """The light [N, 3] that comes back along rays, and the hashes of their decisions [N]."""
-    things: list[Any] = [*scene.spheres, *scene.planes, *scene.cones, *scene.cylinders, *scene.meshes]
+    things = [*chain.from_iterable(getattr(scene, f"{kind}s") for kind in OBJECTS), *scene.meshes]
     materials = [thing.material for thing in things]
     numbers = np.array([*((m.ior, m.alpha, *m.specular) for m in materials), NOTHING])
     light = np.zeros(d.shape)
@@ -223,45 +225,50 @@ def _(plane: Plane, o: Array, d: Array) -> Met:
     return _ahead(-(o @ normal + plane.distance) / (d @ normal)), surface
 
 
-@meet.register(Cone)
-@meet.register(Cylinder)
-def _(thing: Cone | Cylinder, o: Array, d: Array) -> Met:
-    """Closed cones, from the apex to the base, and cylinders: from the first end on, the radius is
-    ``start + slope height``."""
-    cone = isinstance(thing, Cone)
+# Solids of revolution from a first point, the apex of a cone, to another: at the height h of their axis, from
+# 0 to 1, their radius is sqrt(c₀ + c₁ h + c₂ h²) times that at h = 1
+PROFILES = {Cone: (0, 0, 1), Cylinder: (1, 0, 0)}
+
+
+def revolved(thing: Any, o: Array, d: Array) -> Met:
+    """Where rays meet a solid of ``PROFILES``, closed by a disc at each end that is no apex."""
     first, other, radius, _ = vars(thing).values()
     length = norm(np.subtract(other, first))
     axis = np.subtract(other, first) / length
-    start = 0.0 if cone else radius
-    slope = (radius - start) / length
+    squared_radius = Polynomial(radius**2 * np.array(PROFILES[type(thing)]) / length ** np.arange(3))
+    widening = squared_radius.deriv() / 2
     passed = -dot(o - first, d)  # from where the ray is nearest to the first end
     off = o - first + passed[:, None] * d
     height = off @ axis
     rise = d @ axis
     across = off - height[:, None] * axis
     drift = d - rise[:, None] * axis
-    wide = start + slope * height
-    widening = slope * rise
-    # |across + t drift|² = (wide + t widening)²
-    a = dot(drift, drift) - widening**2
-    b = dot(across, drift) - wide * widening
-    c = dot(across, across) - wide**2
+    # |across + t drift|² = squared_radius(height + t rise)
+    a = dot(drift, drift) - squared_radius.coef[2] * rise**2
+    b = dot(across, drift) - rise * widening(height)
+    c = dot(across, across) - squared_radius(height)
     larger = -(b + np.copysign(np.sqrt(b * b - a * c), b))
     side = np.stack([larger / a, c / larger])
     h = height + side * rise
     side[~((h >= 0) & (h <= length))] = np.inf
     discs = np.stack([(length - height) / rise, -height / rise])
     discs[norm(across + discs[..., None] * drift, axis=-1) > radius] = np.inf
-    parts = _ahead(passed + np.concatenate([side, discs[: 2 - cone]]))
+    parts = _ahead(passed + np.concatenate([side, discs if PROFILES[type(thing)][0] else discs[:1]]))
     part = parts.argmin(axis=0)
     t = parts.min(axis=0)
 
     def surface(k: Array) -> tuple[Array, None]:
-        outwards = unit(across[k] + (t - passed)[k, None] * drift[k])
-        normals = [outwards - slope * axis, axis, -axis]
+        along = (t - passed)[k]
+        steepness = widening(height[k] + along * rise[k])
+        outwards = across[k] + along[:, None] * drift[k] - steepness[:, None] * axis
+        normals = [outwards, axis, -axis]
         return unit(np.choose(np.maximum(part[k] - 1, 0)[:, None], normals)), None
 
     return t, surface
+
+
+for _solid in PROFILES:
+    meet.register(_solid, revolved)
 
 
 @meet.register
