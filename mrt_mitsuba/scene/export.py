@@ -92,8 +92,8 @@ def _put_into_files(nodes: Node, stem: str, flavor: str) -> dict[str, bytes]:
                 f"{name} cannot be written as XML: mrt_group is made of arrays; render it from Python, or "
                 "write at most 1000 spheres or 100 objects of another kind"
             )
-        without_stock = flavor == "stock" and "bsdf" in node and kind not in STOCK_SHAPES
-        if kind == "mrt_mesh" or without_stock:
+        is_shape = kind != "" and "bsdf" in node
+        if kind == "mrt_mesh" or (flavor == "stock" and is_shape and kind not in STOCK_SHAPES):
             file = f"{stem}_{name}.ply"
             bsdf = node.pop("bsdf")
             stream = mi.MemoryStream()
