@@ -258,7 +258,8 @@ def inside_cylinder(p, u):
 
 
 def roots(a, half_b, c, discriminant):
-    """Return the roots of a s² + 2 half_b s + c in ascending order; where a vanishes, one of them is huge.
+    """Return the roots of a s² + 2 half_b s + c in ascending order. Where a vanishes it counts as just
+    below 0, and one of them is huge.
 
     Source: the cancellation-free form, e.g. Press et al., Numerical Recipes, §5.6.
     """

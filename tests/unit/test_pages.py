@@ -13,7 +13,7 @@ from mrt_mitsuba.plugins.table import PLUGINS
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 COLUMNS = 78  # wider lines are cut off at the right in a browser
-ALL = 16_455 + 5 * len(PLUGINS)  # words, code included; each plugin has a heading
+ALL = 16_428 + 8 * len(PLUGINS)  # words, code included; each plugin has a heading
 MOST = {
     "README": 900,
     "api": 330,
