@@ -69,7 +69,7 @@ def test_a_timing_takes_fifty_milliseconds(seconds, renders, scene, monkeypatch)
     def render(*args, **options):
         result = mrt.render(*args, **options)
         calls.append(options["seed"])
-        return replace(result, timings=replace(result.timings, total=seconds, load=0.0))
+        return replace(result, timings=replace(result.timings, total=7 + seconds, load=7.0))
 
     monkeypatch.setattr(work_precision, "render", render)
     truth = np.ones((*SIZE[::-1], 3))

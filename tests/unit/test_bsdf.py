@@ -64,7 +64,7 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "unity, alpha 1": {"fresnel": "unity", "diffuse_reflectance": 0.0, "alpha": 1.0},
     "textured": {"alpha": CHECKER, "diffuse_reflectance": CHECKER, "specular_reflectance": 0.3},
     "negative": {"alpha": -0.3, "specular_reflectance": rgb((0.5, 0.3, 0.2)), "diffuse_reflectance": 0.0},
-    "ggx": {**COLORS, **EXACT, "distribution": "ggx", "alpha": 0.2},
+    "ggx": {**COLORS, **EXACT, "distribution": "ggx", "alpha": -0.2},  # as 0.2
     "ggx, narrow, plain sampling": {
         "distribution": "ggx",
         "alpha": 0.02,

@@ -74,6 +74,7 @@ def test_a_scene_without_integrator_is_rendered_by_a_path_tracer(more, kind):
 
 
 OUTER = """<scene version="3.0.0"><integrator type="$integrator"/><include filename="$where/inner.xml"/>
+<default name="whereas" value="sky"/><include filename="$whereas.xml"/>
 <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>
 <integer name="height" value="3"/></film><sampler type="independent">
 <integer name="sample_count" value="$spp"/></sampler></sensor></scene>"""
@@ -85,9 +86,10 @@ SKY = """<scene version="3.0.0"><shape type="sphere" id="ball"><float name="radi
 
 @pytest.fixture
 def nested(tmp_path):
-    """An XML file that includes one in a folder, which includes one next to itself."""
+    """An XML file that includes one in a folder, which includes one next to itself, and one of that name."""
     (tmp_path / "in").mkdir()
-    for name, text in (("outer", OUTER), ("in/inner", INNER), ("in/sky", SKY)):
+    above = '<scene version="3.0.0"><default name="dim" value="1"/></scene>'
+    for name, text in (("outer", OUTER), ("in/inner", INNER), ("in/sky", SKY), ("sky", above)):
         (tmp_path / f"{name}.xml").write_text(text)
     return tmp_path / "outer.xml"
 
@@ -113,7 +115,7 @@ def test_parameters_of_a_file_and_those_that_it_includes(nested, options, value,
 
 wrong = Cases()
 wrong(ALL | {"glo": 3}, r"has no parameter \$glo: did you mean glow\?")
-wrong(ALL | {"zzz": 3}, r"has no parameter \$zzz: it has glow, integrator, spp, where")
+wrong(ALL | {"zzz": 3}, r"has no parameter \$zzz: it has dim, glow, integrator, spp, where, whereas")
 wrong({"where": "in"}, r"undefined parameter: \$integrator")
 wrong(ALL | {"ball.centre": [0, 0, 5]}, r"no parameter ball.centre: did you mean ball.center\?")
 wrong(ALL | {"ball.center": [0, 5]}, "must be a Point3f")
