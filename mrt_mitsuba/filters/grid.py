@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import importlib
-import math
 import operator
 import sys
 from collections.abc import Callable, Sequence
@@ -108,13 +107,6 @@ class Grid:
             for channel, plane in enumerate(planes):
                 dr.scatter(flat, plane, len(planes) * self.index + channel)
         return np.array(flat).reshape(self.rows, self.columns, *channels)
-
-
-def check_numbers(**options: float) -> None:
-    """Raise ``UsageError`` for an option that is NaN."""
-    for name, value in options.items():
-        if math.isnan(value):
-            raise UsageError(f"{name} is not a number; give one")
 
 
 def finite(planes: Sequence[Float]) -> Mask:
