@@ -10,9 +10,9 @@ from pathlib import Path
 
 from mrt_mitsuba.errors import UsageError
 
-# For every pixel: what is kept, by channel, and what Pillow needs to write a PNG
+# For every pixel: what is kept, by channel, and what a PNG needs: 8 bit, and a copy that Pillow makes
 BYTES_PER_CHANNEL = 4
-BYTES_TO_WRITE = 4
+BYTES_TO_WRITE = 7
 
 # A wavefront's arrays, per ray and channel: what the kernel writes, what is formed of it, and the part before
 BYTES_PER_CHANNEL_OF_RAY = 12
@@ -91,7 +91,7 @@ class Workspace:
             dr.flush_malloc_cache()
 
 
-def memory(group: Path = GROUP) -> tuple[int, int]:
+def memory() -> tuple[int, int]:
     """Return the free bytes, and those of the machine, within the limit of this process's control group."""
     import psutil
 
@@ -99,8 +99,8 @@ def memory(group: Path = GROUP) -> tuple[int, int]:
     free = state.available
     total = state.total
     with contextlib.suppress(OSError, ValueError):  # no such group, or "max"
-        limit = int((group / "memory.max").read_text())
-        used = int((group / "memory.current").read_text())
+        limit = int((GROUP / "memory.max").read_text())
+        used = int((GROUP / "memory.current").read_text())
         free = min(free, limit - used)
         total = min(total, limit)
     return max(0, free), total
@@ -117,13 +117,13 @@ def affinity() -> list[int]:
     return list(range(os.cpu_count() or 1))
 
 
-def usable_cores(group: Path = GROUP) -> int:
+def usable_cores() -> int:
     """Return the number of cores of this process's affinity, or of its control group's quota if that is less.
 
     A quota of one and a half cores counts as two.
     """
     count = len(affinity())
     with contextlib.suppress(OSError, ValueError):  # no such group, or "max"
-        quota, period = map(int, (group / "cpu.max").read_text().split())
+        quota, period = map(int, (GROUP / "cpu.max").read_text().split())
         count = min(count, math.ceil(quota / period))
     return count

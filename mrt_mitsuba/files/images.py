@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import stat
@@ -13,7 +14,6 @@ from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Any
 
 from mrt_mitsuba.errors import OutputError, UsageError, warn
-from mrt_mitsuba.files.layers import LAYERS
 from mrt_mitsuba.files.replacing import replacing
 from mrt_mitsuba.interrupts import defer_signals, deliver_pending
 from mrt_mitsuba.machine import usable_cores
@@ -52,11 +52,9 @@ def save(
 ) -> None:
     """Write a linear picture [H, W, 3] in the formats that the endings of ``paths`` name, .png or .exr.
 
-    All files are replaced, or none. Layers, header and ``compression`` ("zip", lossless, or "none") are for
-    EXR files, ``tonemap`` (see ``to_8bit``) for PNG files. A layer is named by one channel ("depth.Z",
-    [H, W]) or as a whole ("depth", [H, W]; "normal", [H, W, 3]), with the channels of ``LAYERS``, else R, G,
-    B or Y. Header values are text or numbers; anything else is written as JSON. ``inputs``: files that the
-    picture is made from.
+    All files are replaced, or none. Layers, [H, W] by channel ("depth.Z"), header and ``compression`` ("zip",
+    lossless, or "none") are for EXR files, ``tonemap`` (see ``to_8bit``) for PNG files. Header values are
+    text or numbers; anything else is written as JSON. ``inputs``: files that the picture is made from.
 
     Raises ``OutputError`` for a file that cannot be written, or that is one of ``inputs``, and for pixels,
     names or values that a picture cannot hold; ``UsageError`` without a name of a file.
@@ -66,12 +64,12 @@ def save(
     paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not paths:
         raise UsageError('save: give the name of a file, such as "out.exr"')
+    endings = []
     for path in paths:
         if not isinstance(path, str | os.PathLike):
             raise UsageError(f'save: {path!r} is no name of a file; give one such as "out.exr"')
-    endings = [os.path.splitext(os.fspath(path))[1].lower() for path in paths]
-    for path, ending in zip(paths, endings, strict=True):
-        if ending not in (".png", ".exr"):
+        endings.append(os.path.splitext(os.fspath(path))[1].lower())
+        if endings[-1] not in (".png", ".exr"):
             raise OutputError(f"cannot write {os.fspath(path)}: the name must end in .png or .exr")
     with replacing(*paths, inputs=inputs) as files:
         for file, ending in zip(files, endings, strict=True):
@@ -105,11 +103,7 @@ def _picture(image: Any) -> Image:
 def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
     from PIL import Image as PilImage
 
-    image = _picture(image)
-    height, width = image.shape[:2]
-    picture = PilImage.new("RGB", (width, height))
-    for row, block in _blocks(image, tonemap):
-        picture.paste(PilImage.fromarray(block), (0, row))
+    picture = PilImage.fromarray(to_8bit(_picture(image), tonemap))
     picture.save(file, format="PNG", compress_type=PNG_RUNS)
 
 
@@ -165,17 +159,9 @@ def _planes(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
 
     planes = {"RGB": np.ascontiguousarray(_picture(image))}
     for name, values in layers.items():
-        _check_name(name)
-        array = np.atleast_3d(_floats(values, f"layer {name}"))
-        letters = "RGB" if array.shape[2] == 3 else "Y"
-        if name in LAYERS:
-            letters = LAYERS[name].letters
-        names = [f"{name}.{letter}" for letter in letters]
-        if "." in name or name == "A":  # a channel by itself
-            names = [name]
-        if array.shape != (*planes["RGB"].shape[:2], len(names)):
-            raise OutputError(f"layer {name} of shape {array.shape} is no {' '.join(names)} of the picture")
-        planes |= {each: np.ascontiguousarray(array[:, :, index]) for index, each in enumerate(names)}
+        planes[name] = np.ascontiguousarray(_floats(values, f"layer {name}"))
+        if planes[name].shape != planes["RGB"].shape[:2]:
+            raise OutputError(f"layer {name} of shape {planes[name].shape} is no channel of the picture")
     return planes
 
 
@@ -303,28 +289,8 @@ def to_8bit(image: Image, tonemap: str = "report") -> NDArray[np.uint8]:
     """
     import numpy as np
 
-    pixels = np.empty(image.shape, np.uint8)
-    for row, block in _blocks(image, tonemap):
-        pixels[row : row + len(block)] = block
-    return pixels
-
-
-def png(image: Image) -> bytes:
-    """A linear picture [H, W, 3] as a PNG file, in sRGB as screens expect it."""
-    import io
-
-    from PIL import Image as PilImage
-
-    buffer = io.BytesIO()
-    PilImage.fromarray(to_8bit(image, "srgb")).save(buffer, format="PNG")
-    return buffer.getvalue()
-
-
-def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """The picture in 8 bit as ``to_8bit`` gives it, some rows at a time with the number of the first."""
-    import numpy as np
-
     check("tonemap", TONEMAP, tonemap)
+    pixels = np.empty(image.shape, np.uint8)
     rows = max(1, _PIXELS // image.shape[1])
     lost = 0
     for row in range(0, len(image), rows):
@@ -336,6 +302,14 @@ def _blocks(image: Image, tonemap: str) -> Iterator[tuple[int, NDArray[np.uint8]
         else:
             encoded = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
             values = encoded * 255 + 0.5
-        yield row, values.astype(np.uint8)
+        pixels[row : row + rows] = values.astype(np.uint8)
     if lost:
         warn(f"{lost} pixels are NaN; the PNG holds 0 there")
+    return pixels
+
+
+def png(image: Image) -> bytes:
+    """A linear picture [H, W, 3] as a PNG file, in sRGB as screens expect it."""
+    buffer = io.BytesIO()
+    _write_png(buffer, image, "srgb")
+    return buffer.getvalue()

@@ -94,7 +94,7 @@ def test_infinite_depths_are_equal_where_both_are():
 def mean_of(rays: np.ndarray, path: Path) -> Path:
     """Write the mean of rays [N, H, W, C] with its standard error."""
     error = np.sqrt(rays.var(axis=0, ddof=1).mean(axis=-1) / len(rays))
-    save(path, np.broadcast_to(rays.mean(axis=0), (*error.shape, 3)), layers={"error": error})
+    save(path, np.broadcast_to(rays.mean(axis=0), (*error.shape, 3)), layers={"error.Y": error})
     return path
 
 
@@ -143,8 +143,8 @@ def test_results_have_layers(variant):
 @pytest.fixture
 def files(tmp_path: Path) -> dict[str, str]:
     depth = np.full((12, 16), 2.0, np.float32)
-    save(tmp_path / "a.exr", spotted(), layers={"depth": 1.5 * depth})
-    save(tmp_path / "b.exr", GREY, layers={"depth": depth})
+    save(tmp_path / "a.exr", spotted(), layers={"depth.Z": 1.5 * depth})
+    save(tmp_path / "b.exr", GREY, layers={"depth.Z": depth})
     save(tmp_path / "nan.exr", np.where(spotted() > 0.55, np.nan, GREY))
     kind = {"type": OpenEXR.scanlineimage}
     shifted = {"dataWindow": ((100, 200), (115, 211)), "displayWindow": ((0, 0), (639, 479))}

@@ -13,7 +13,7 @@ from nodes import rgb, sensor
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
 from mrt_mitsuba.files.images import save
-from mrt_mitsuba.rendering.seeds import derived_seed
+from mrt_mitsuba.rendering.film import derived_seed
 from mrt_mitsuba.validation import work_precision
 from mrt_mitsuba.validation.work_precision import Findings, Point, frontier
 
@@ -151,7 +151,7 @@ def test_references_of_other_kinds(variant, tmp_path):
         two = found.points["aa=2"]
         assert (two.rmse, *two.rmse_interval) == pytest.approx((error,) * 3, rel=1e-4)  # nothing is random
         assert np.isnan(two.efficiency)
-    save(tmp_path / "noisy.exr", best.image, layers={"error": np.full((24, 32), 0.01)})
+    save(tmp_path / "noisy.exr", best.image, layers={"error.Y": np.full((24, 32), 0.01)})
     noisy = tmp_path / "noisy.exr"
     with pytest.warns(mrt.MrtWarning, match="too coarse, its own RMSE is 0.01"):
         found = mrt.error_vs_time(scene, {"a": {}}, reference=noisy, repeats=1, shared=lattice)

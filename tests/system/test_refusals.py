@@ -85,7 +85,7 @@ refused("out scene=a.obj", "out.exr: what is written is made", linked_mtl)
 refused("export scene=l.xml --xml ./a.xml", "a.xml: what is written is", linked_scene)
 misused("export scene=a.xml --xml b.xml --stock", "flavor=stock is of no use with an XML file", xml(""))
 
-misused("out width=16384 height=16384 aa=1 memory=512M", "needs 4.1 GiB of memory, and 512 MiB")
+misused("out width=16384 height=16384 aa=1 memory=512M", "needs 4.9 GiB of memory, and 512 MiB")
 misused("out scene=a.xml memory=512M", "a picture of 99999x99999 pixels needs", xml("", LARGE))
 
 # ----------------------------------------------- Files -----------------------------------------------

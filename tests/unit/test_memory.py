@@ -19,12 +19,12 @@ GIB = 2**30
 @pytest.mark.parametrize(
     ("more", "needed"),
     [
-        # 2^28 pixels of three floats, four bytes to write them, 24 rows under a filter, kernels: 4.1 GiB
-        ({}, "4.1 GiB"),
+        # 2^28 pixels of three floats, seven bytes to write them, 24 rows under a filter, kernels: 4.9 GiB
+        ({}, "4.9 GiB"),
         # twice the floats
-        ({"pictures": 2}, "7.1 GiB"),
+        ({"pictures": 2}, "7.9 GiB"),
         # 2^26 rays of three floats each, three times
-        ({"rays_per_pixel": 2**26}, "6.3 GiB"),
+        ({"rays_per_pixel": 2**26}, "7.0 GiB"),
     ],
 )
 def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
@@ -40,9 +40,10 @@ def show(group: Path, files: dict[str, str]) -> Path:
 
 
 @pytest.mark.parametrize(("limit", "found"), [(str(GIB), (GIB // 2, GIB)), ("max", None)])
-def test_the_limit_of_a_control_group_counts(tmp_path, limit, found):
-    show(tmp_path, {"memory.max": f"{limit}\n", "memory.current": f"{GIB // 2}\n"})
-    free, total = machine.memory(tmp_path)
+def test_the_limit_of_a_control_group_counts(tmp_path, monkeypatch, limit, found):
+    files = {"memory.max": f"{limit}\n", "memory.current": f"{GIB // 2}\n"}
+    monkeypatch.setattr(machine, "GROUP", show(tmp_path, files))
+    free, total = machine.memory()
     assert found == (free, total) or (found is None and total == psutil.virtual_memory().total)
 
 
@@ -58,8 +59,9 @@ quotas({"cpu.max": "nonsense"}, ALL)
 
 
 @pytest.mark.parametrize(("files", "cores"), quotas)
-def test_quotas_of_control_groups(tmp_path, files, cores):
-    assert usable_cores(show(tmp_path, files)) == cores
+def test_quotas_of_control_groups(tmp_path, monkeypatch, files, cores):
+    monkeypatch.setattr(machine, "GROUP", show(tmp_path, files))
+    assert usable_cores() == cores
 
 
 @pytest.mark.skipif(ALL < 2, reason="needs two cores")
