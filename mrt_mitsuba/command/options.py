@@ -1,13 +1,18 @@
-"""The options of the ``mrt`` command: of ``RenderSettings`` and its own, one table for parsing and help."""
+"""The words of the ``mrt`` command: options of ``RenderSettings`` and its own, in one table with their help.
+
+argparse reads them; ``name=value`` is short for ``--name=value``.
+"""
 
 from __future__ import annotations
 
+import argparse
+import difflib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NoReturn
 
-from mrt_mitsuba.command.parser import Parser
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.files.images import COMPRESSION, TONEMAP
 from mrt_mitsuba.options import SWITCH, Kind, check, choice, either, is_obj, is_path, option, table
@@ -16,6 +21,10 @@ from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.scene.model import MODEL_OPTIONS
 from mrt_mitsuba.scene.report import NUMBERS
 
+WIDTH = 100  # characters of a line of help
+COLUMN = 30  # where explanations start
+REPEATABLE = "plugins"  # the option that may be given several times
+REQUIRED = ("xml", "cases")  # options of sub-commands
 FORM = "mrt FILENAME [SCENE] [name=value ...]"
 ABOUT = "Renders a scene and writes FILENAME.png and FILENAME.exr; FILENAME has no extension."
 SCENES = [str(number) for number in NUMBERS]
@@ -64,27 +73,96 @@ class Options(RenderSettings):
 TABLE = table(Options)
 
 
-def add_options(parser: Parser, names: Iterable[str]) -> None:
-    """Add options of the table to a parser."""
-    for name in names:
-        about = TABLE[name].metadata
-        text = f"{about['help']} (default: {about['shown'] or TABLE[name].default})"
-        parser.option(name, about["kind"].form, text, repeatable=name == "plugins")
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Shows options as they are written, ``name=FORM``."""
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        return getattr(action, "form", "") or super()._format_action_invocation(action)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser of the words of one command, whose options are ``name=value``, each at most once.
+
+    ``words``: the help of "WORD", "name=FORM" and "--flag"; ``options``: names in ``TABLE``.
+    """
+
+    def __init__(
+        self, prog: str, usage: str, text: str, words: Mapping[str, str], options: Iterable[str]
+    ) -> None:
+        super().__init__(
+            prog=prog,
+            usage=usage,
+            description=text,
+            add_help=False,
+            allow_abbrev=False,
+            argument_default=argparse.SUPPRESS,
+            formatter_class=partial(_Help, width=WIDTH, max_help_position=COLUMN),
+        )
+        self.forms: dict[str, str] = {}  #: of the options, by name
+        if "scene" in options:
+            numbers = f"number of a scene, {SCENES[0]} to {SCENES[-1]}, or an XML or OBJ file"
+            self.add_argument("number", metavar="SCENE", nargs="?", help=numbers)
+        for word, explained in words.items():
+            name, equals, form = word.partition("=")
+            plain = word.strip("[]")
+            if equals:
+                self._option(name, form, explained, required=name in REQUIRED)
+            elif word.startswith("--"):
+                self.add_argument(word, action="store_true", help=explained)
+            else:
+                key = plain.partition(".")[0].lower()
+                self.add_argument(key, metavar=plain, nargs=None if plain == word else "?", help=explained)
+        for name in options:
+            about = TABLE[name].metadata
+            explained = f"{about['help']} (default: {about['shown'] or TABLE[name].default})"
+            action = "append" if name == REPEATABLE else "store"
+            self._option(name, about["kind"].form, explained, action=action)
+
+    def _option(self, name: str, form: str, text: str, **more: Any) -> None:
+        action: Any = self.add_argument(f"--{name}", help=text.replace("%", "%%"), **more)
+        action.form = f"{name}={form}"
+        self.forms[name] = form
+
+    def error(self, message: str) -> NoReturn:
+        """Raise ``UsageError`` with the command's usage."""
+        raise UsageError(f"{message.replace('arguments are', 'is')}. {' '.join(self.format_usage().split())}")
+
+    def unknown(self, name: str) -> NoReturn:
+        """Raise ``UsageError`` for an option that is not known, naming the nearest."""
+        close = difflib.get_close_matches(name.lstrip("-").lower(), self.forms, n=1)
+        hint = f"Did you mean {close[0]}?" if close else f"'{self.prog} --help' lists the options."
+        raise UsageError(f"unknown option {name!r}. {hint}")
+
+    def read(self, words: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
+        """Return values by name, and those of unknown names; raise ``UsageError`` for other words."""
+        arguments: list[str] = []
+        others: dict[str, str] = {}
+        given: set[str] = set()
+        for word in words:
+            name, equals, value = word.partition("=")
+            name = name.removeprefix("--")
+            if not equals or arguments[-1:] in ([f"--{each}"] for each in self.forms):  # its value
+                arguments.append(word)
+                continue
+            if name in given - {REPEATABLE}:
+                raise UsageError(f"{name} is given twice")
+            given.add(name)
+            if name in self.forms:
+                arguments.append(f"--{name}={value}")
+            else:
+                others[name] = value
+        found, rest = self.parse_known_args(arguments)
+        if rest and rest[0].startswith("-"):
+            self.unknown(rest[0])
+        if rest:
+            self.error(f"unexpected argument {rest[0]!r}")
+        return vars(found), others
 
 
 def render_parser() -> Parser:
     """Return the parser of the words after FILENAME."""
-    parser = Parser(prog="mrt", usage=f"{FORM}\n       mrt COMMAND ...", description=ABOUT)
-    add_scene(parser)
-    add_options(parser, (name for name in TABLE if name not in parser.forms))
-    return parser
-
-
-def add_scene(parser: Parser) -> None:
-    """Add SCENE, scene=PATH and plugins=FILE.py."""
-    text = f"number of a scene, {SCENES[0]} to {SCENES[-1]}, or an XML or OBJ file"
-    parser.add_argument("number", metavar="SCENE", nargs="?", help=text)
-    add_options(parser, ("scene", "plugins"))
+    first = ("scene", "plugins")
+    return Parser("mrt", f"{FORM}\n       mrt COMMAND ...", ABOUT, {}, dict.fromkeys((*first, *TABLE)))
 
 
 def read_scene(parser: Parser, words: Sequence[str]) -> dict[str, Any]:

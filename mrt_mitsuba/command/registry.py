@@ -7,14 +7,12 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import NamedTuple
 
-from mrt_mitsuba.command.options import add_options, add_scene, read_scene
-from mrt_mitsuba.command.parser import Parser
+from mrt_mitsuba.command.options import Parser, read_scene
 from mrt_mitsuba.scene.model import MODEL_OPTIONS
 
 TOOLS = "mrt_mitsuba.command.tools"
 CHECKS = "mrt_mitsuba.validation.commands"
 HELP = {"-h", "--help"}
-REQUIRED = ("xml", "cases")  # options of sub-commands
 AT_LEAST = ("psnr", "p_value")  # limits that a measure must reach; it must not exceed the others
 LIMITS = ("mae", "rmse", "rel_mse", "display", "psnr", "largest", "flip", "p_value")
 
@@ -111,20 +109,8 @@ COMMANDS = {
 def command_parser(name: str) -> Parser:
     """Return the parser of a sub-command."""
     command = COMMANDS[name]
-    parser = Parser(prog=f"mrt {name}", usage=f"mrt {name} {command.form}".strip(), description=command.text)
-    if "scene" in command.options:
-        add_scene(parser)
-    for word, text in command.words.items():
-        key, equals, form = word.partition("=")
-        if equals:
-            parser.option(key, form, text, required=key in REQUIRED)
-        elif word.startswith("--"):
-            parser.add_argument(word, action="store_true", help=text)
-        else:
-            key = word.strip("[]").partition(".")[0].lower()
-            parser.add_argument(key, metavar=word.strip("[]"), nargs="?" if "[" in word else None, help=text)
-    add_options(parser, [each for each in command.options if each not in parser.forms])
-    return parser
+    usage = f"mrt {name} {command.form}".strip()
+    return Parser(f"mrt {name}", usage, command.text, command.words, command.options)
 
 
 def run(name: str, words: Sequence[str]) -> int:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.adaptive.target import Target
-from mrt_mitsuba.command import options, parser, tools
+from mrt_mitsuba.command import options, tools
 from mrt_mitsuba.command.options import Options, parse
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.files import LAYERS
@@ -125,7 +125,7 @@ def test_values_from_python(name, value, taken):
 
 def test_usage_names_every_option_with_its_default():
     text = tools.usage()
-    assert max(map(len, text.splitlines())) <= parser.WIDTH
+    assert max(map(len, text.splitlines())) <= options.WIDTH
     entries = re.split(r"\n  (?=\w+=)", text.partition("\n\ncommands")[0])[1:]
     assert {entry.partition("=")[0] for entry in entries} == options.TABLE.keys()
     assert all(re.search(r"\(default:\s+[^)]+\)$", entry) for entry in entries)
