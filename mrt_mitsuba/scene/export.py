@@ -32,8 +32,8 @@ def write_xml(
 
     ``scene`` and what follows ``flavor`` are those of ``render``, a scene being a number, a ``Scene``, or the
     path of an OBJ or XML file; an XML file is written with its includes and parameters filled in. XML cannot
-    hold arrays: each mesh, and in the stock flavor each cone, goes into a PLY file next to it, named after
-    the XML file and the shape; all files are replaced, or none.
+    hold arrays: each mesh, and in the stock flavor each cone and cylinder, goes into a PLY file next to it,
+    named after the XML file and the shape; all files are replaced, or none.
 
     Raises ``OutputError`` if a file cannot be written, or is one that the scene is read from; ``SceneError``
     for groups of objects (``mrt_group``), which have neither an XML form nor a stock counterpart; and what

@@ -23,7 +23,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.errors import SceneError, UsageError, one_line
 from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.mitsuba_changes import mitsuba_first, mitsuba_home
 from mrt_mitsuba.options import Values
@@ -56,7 +56,7 @@ def load_dict(
     """
     inputs = set() if inputs is None else inputs
     with _loading(name):
-        _check_dict(scene, inputs)
+        _check_dict(scene)
         state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)
         _check_nodes(state.nodes, inputs)
         return _instantiate(state, merge, keys or {})
@@ -104,8 +104,9 @@ def load_file(
         for node in state.nodes:
             if isinstance(node.props.get("filename", None), str):
                 node.props["filename"] = os.path.abspath(_resolved(node.props["filename"]))
-        if strange := _set_properties(state, keys):
-            raise UsageError(f"{path} does not state {min(strange)}: write it into the file")
+        unset, _ = _set_properties(state, keys)
+        if unset:
+            raise UsageError(f"{path} does not state {min(unset)}: write it into the file")
         return mi.parser.write_string(state), expansion.values
 
 
@@ -113,7 +114,7 @@ def load_file(
 
 
 def _check_nodes(nodes: Iterable[mi.parser.SceneNode], inputs: set[str]) -> None:
-    """Check the plugins, sample counts and files of parsed nodes."""
+    """Check the plugins, sample counts and files of parsed nodes, and note the files."""
     mitsuba_first()  # a <path> of the file puts its folder before
     for node in nodes:
         kind = node.props.plugin_name()
@@ -122,17 +123,18 @@ def _check_nodes(nodes: Iterable[mi.parser.SceneNode], inputs: set[str]) -> None
         samples = node.props.get("sample_count", 1)
         if isinstance(samples, int) and not 1 <= samples <= MAX_SAMPLE_COUNT:
             raise RuntimeError(f"{kind}: sample_count is {samples}; give 1 to {MAX_SAMPLE_COUNT}")
-        if isinstance(filename, str):
-            _check_data(filename, inputs)
+        if isinstance(filename, str) and filename:
+            from mrt_mitsuba.scene.files import require_file
+
+            inputs.add(_resolved(filename))
+            if os.path.exists(_resolved(filename)):  # Mitsuba itself reports a missing file
+                require_file(_resolved(filename))
 
 
 def _instantiate(state: mi.parser.ParserState, merge: bool, keys: Values) -> mi.Object:
     """Instantiate the objects, after setting properties that the scene gives (``ball.center``); set other
     keys by ``mi.traverse`` (``ball.to_world``)."""
-    unset = _set_properties(state, keys)
-    stated = (
-        [key for node, place in _named_nodes(state) for key in _property_keys(node, place)] if unset else []
-    )
+    unset, stated = _set_properties(state, keys)
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False
     config.merge_meshes = merge
@@ -156,38 +158,30 @@ _TYPE_NAMES = {
 }
 
 
-def _named_nodes(state: mi.parser.ParserState) -> Iterator[tuple[mi.parser.SceneNode, str]]:
-    """Yield the nodes that have a name: their path in a dict, or their id in XML."""
-    places = state.node_paths
-    for number, node in enumerate(state.nodes):
-        place = places[number] if places else node.props.id()
-        if place:
-            yield node, place
-
-
-def _property_keys(node: mi.parser.SceneNode, place: str) -> list[str]:
-    return [f"{place}.{name}" for name in node.props if _kind(node.props[name]) in _TYPE_NAMES]
-
-
 def _kind(value: object) -> str:
     return type(value).__name__.removeprefix("Scalar")
 
 
-def _set_properties(state: mi.parser.ParserState, keys: Values) -> Values:
-    """Set properties of parsed nodes; return the values of other keys."""
-    unset = dict(keys)
-    owners = {key.rpartition(".")[0] for key in keys}
-    for node, place in _named_nodes(state):
-        if place not in owners:
-            continue
-        for key in keys.keys() & {*_property_keys(node, place)}:
-            name = key.rpartition(".")[2]
-            before = node.props[name]
-            node.props[name] = _converted(key, unset.pop(key), type(before), _TYPE_NAMES[_kind(before)])
-    return unset
+def _set_properties(state: mi.parser.ParserState, keys: Values) -> tuple[Values, list[str]]:
+    """Set properties of parsed nodes; return the values of other keys, and the keys of all properties.
+
+    A key is the node's path in a dict, or its id in XML, and the name of the property.
+    """
+    places = state.node_paths or [node.props.id() for node in state.nodes]
+    known = {
+        f"{place}.{name}": (node.props, name)
+        for node, place in zip(state.nodes, places, strict=True)
+        for name in (node.props if place and keys else ())
+        if _kind(node.props[name]) in _TYPE_NAMES
+    }
+    for key in keys.keys() & known.keys():
+        properties, name = known[key]
+        before = properties[name]
+        properties[name] = _converted(key, keys[key], type(before), _TYPE_NAMES[_kind(before)])
+    return {key: keys[key] for key in keys if key not in known}, [*known]
 
 
-def set_parameters(loaded: mi.Object, values: Values, stated: Sequence[str] = ()) -> None:
+def set_parameters(loaded: mi.Object, values: Values, stated: Sequence[str]) -> None:
     """Set values by their ``mi.traverse`` key; raise ``UsageError`` for unknown ones and wrong types.
 
     ``stated``: keys of properties, which a message may suggest.
@@ -228,8 +222,7 @@ def _loading(name: str, folder: str | None = None) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        text = " ".join(_ORIGIN.sub("", str(error)).split())
-        raise SceneError(f"cannot load {name}: {text}") from error
+        raise SceneError(f"cannot load {name}: {one_line(_ORIGIN.sub('', str(error)))}") from error
     finally:
         mi.set_file_resolver(before)
 
@@ -252,33 +245,19 @@ def _check_plugin(plugin: str) -> None:
         )
 
 
-def _check_data(filename: str, inputs: set[str]) -> str:
-    """Refuse a pipe, a device or a folder; otherwise note the path and return it. Mitsuba itself reports a
-    missing file."""
-    path = _resolved(filename) if filename else ""
-    if os.path.exists(path):
-        from mrt_mitsuba.scene.files import require_file
-
-        require_file(path)
-    inputs.add(path)
-    return path
-
-
-def _check_dict(node: Values, inputs: set[str], place: str = "", depth: int = 1) -> None:
+def _check_dict(node: Values, place: str = "", depth: int = 1) -> None:
     """Check every entry: None, cycles and depth would end the process."""
     if depth > MAX_DEPTH:
         raise RuntimeError(f"it is nested more than {MAX_DEPTH} levels deep")
     for key, value in node.items():
         if isinstance(value, dict):
-            _check_dict(value, inputs, f"{place}{key}.", depth + 1)
+            _check_dict(value, f"{place}{key}.", depth + 1)
         elif value is None:
             raise RuntimeError(f"{place}{key} is None; give it a value, or leave it out")
         elif key == "type" and not isinstance(value, str):
             raise RuntimeError(f"{place}type is {value!r}; give the name of a plugin")
         elif key == "type":
             _check_plugin(value)
-        elif key == "filename" and isinstance(value, str):
-            _check_data(value, inputs)
 
 
 def _check_parameters(path: str, given: Iterable[str], known: set[str]) -> None:

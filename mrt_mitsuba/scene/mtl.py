@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -117,7 +117,7 @@ class _Reader:
         elif statement in _KNOWN:
             if not self.name:
                 raise SceneError(f"{where}: {statement} comes before any newmtl; write newmtl NAME before it")
-            read = self._texture(text, where) if statement == "map_Kd" else _numbers(statement, text, where)
+            read = self._texture(text, where) if statement == "map_Kd" else _value(statement, text, where)
             if statement in CONVENTIONS[self.convention]:
                 self.blocks[self.name][CONVENTIONS[self.convention][statement]] = read
         elif statement:
@@ -151,36 +151,32 @@ class _Reader:
             name, *values = option.split()
             if name in fields:
                 target, second = fields[name]
-                self.blocks[self.name][target] = (*_floats(option, values, where), second)[:2]
+                problem = f"{where}: {option[:80]!r} must have one to three finite numbers"
+                numbers = _numbers(values, (1, 2, 3), -MAX_FLOAT, problem)
+                self.blocks[self.name][target] = (*numbers, second)[:2]
             else:
                 self._unused(option, where)
 
 
-def _floats(option: str, words: list[str], where: str) -> list[float]:
-    """Return the one to three numbers of an option."""
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = []
-    if not 1 <= len(numbers) <= 3 or not all(abs(number) <= MAX_FLOAT for number in numbers):
-        raise SceneError(f"{where}: {option[:80]!r} must have one to three finite numbers")
-    return numbers
-
-
-def _numbers(statement: str, text: str, where: str) -> Any:
+def _value(statement: str, text: str, where: str) -> Any:
     """Return the colour, index or roughness of a statement. Raises ``SceneError`` for anything else."""
-    counts = {1: "one number"}
-    if statement[0] == "K":
-        counts = {1: "one", 3: "three numbers"}
-    try:
-        values = list(map(float, text.split()))
-    except ValueError:
-        values = []
-    if len(values) not in counts or not all(0 <= v <= MAX_FLOAT for v in values):
-        must = f"must be {' or '.join(counts.values())}, finite and not negative, but is"
-        raise SceneError(f"{where}: {statement} {must} {text[:80]!r}")
+    colour = statement[0] == "K"
+    must = f"must be {'one or three numbers' if colour else 'one number'}, finite and not negative, but is"
+    problem = f"{where}: {statement} {must} {text[:80]!r}"
+    values = _numbers(text.split(), (1, 3) if colour else (1,), 0.0, problem)
     if statement == "Ns":
         return math.sqrt(2 / (values[0] + 2))
     if statement in ("Kd", "Ks"):
         return values[0], values[len(values) // 2], values[-1]
     return values[0]
+
+
+def _numbers(words: Sequence[str], counts: Sequence[int], low: float, problem: str) -> list[float]:
+    """Return finite numbers, each at least ``low``; raise ``SceneError`` with the ``problem`` for others."""
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in counts or not all(low <= number <= MAX_FLOAT for number in numbers):
+        raise SceneError(problem)
+    return numbers

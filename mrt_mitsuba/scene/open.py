@@ -12,7 +12,7 @@ from typing import Any, SupportsIndex
 import mitsuba as mi
 
 from mrt_mitsuba.adaptive.target import AdaptiveIntegrator, Goal, Target
-from mrt_mitsuba.errors import SceneError, UsageError, warn
+from mrt_mitsuba.errors import SceneError, UsageError, one_line, warn
 from mrt_mitsuba.options import Values, is_obj, is_path
 from mrt_mitsuba.plugins.variants import text_of
 from mrt_mitsuba.scene.loading import load_dict, load_file
@@ -204,7 +204,5 @@ def _integrator(name: str, integrator: Any, scene: mi.Scene) -> mi.Integrator:
         integrator = load_dict(integrator, f"the integrator {integrator.get('type')!r}")
     _check_variant("integrator", integrator)
     if not isinstance(integrator, mi.Integrator):
-        raise UsageError(
-            f"the integrator is {' '.join(text_of(integrator).split())}: it must be one, such as path"
-        )
+        raise UsageError(f"the integrator is {one_line(text_of(integrator))}: it must be one, such as path")
     return integrator

@@ -47,8 +47,8 @@ def scene_dict(
 
     ``flavor``: "mrt" for this project's plugins; "stock" for the nearest equivalents among Mitsuba's, which
     any Mitsuba program opens: ``roughplastic`` for the material, ``point`` lights as bright at the camera's
-    target, finite squares for planes, ``cylinder`` and two ``disk`` for a cylinder, ``bitmap`` for a
-    texture, and ``path`` with few bounces. Cones and meshes have one in files only: see ``export.write_xml``.
+    target, finite squares for planes, ``bitmap`` for a texture, and ``path`` with few bounces. Cones,
+    cylinders and meshes have one in files only: see ``export.write_xml``.
 
     Raises ``UsageError`` for an unknown scene, flavor or formula and for a size out of range, ``SceneError``
     for a scene without a stock flavor.

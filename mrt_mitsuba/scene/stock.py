@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import mitsuba as mi
 import numpy as np
 
 from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.scene.model import Node, Scene
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
 # The finite stand-in of a plane, scene units: beyond, float32 makes its intersections visibly wrong
 STOCK_EXTENT = 100.0
 
-STOCK_SHAPES = ("sphere", "mrt_plane", "mrt_cylinder")  # all that have a counterpart
+STOCK_SHAPES = ("sphere", "mrt_plane")  # all that have a counterpart
 
 
 def stock(nodes: Node, scene: Scene) -> Node:
-    """Replace every plugin of this project by its nearest stock equivalent, which may take several nodes."""
+    """Replace every plugin of this project by its nearest stock equivalent."""
     result: Node = {}
     for name, node in nodes.items():
         kind = node["type"] if isinstance(node, dict) else ""
@@ -34,15 +29,7 @@ def stock(nodes: Node, scene: Scene) -> Node:
             value = [squared * c for c in node["intensity"]["value"]]
             result[name] = {**node, "type": "point", "intensity": {"type": "rgb", "value": value}}
         elif kind == "mrt_plane":
-            foot = np.multiply(-node["distance"] / np.linalg.norm(node["normal"]), node["normal"])
-            square = _facing(foot, node["normal"], STOCK_EXTENT / 2)
-            result[name] = {"type": "rectangle", "to_world": square, "bsdf": node["bsdf"]}
-        elif kind == "mrt_cylinder":  # an open tube, and at each end a disc that faces away from the other
-            result[f"{name}_tube"] = {**result.pop(name), "type": "cylinder"}
-            ends = node["p0"], node["p1"]
-            for number, (center, opposite) in enumerate((ends, ends[::-1])):
-                to_world = _facing(center, np.subtract(center, opposite), node["radius"])
-                result[f"{name}_disc{number}"] = {"type": "disk", "to_world": to_world, "bsdf": node["bsdf"]}
+            result[name] = {"type": "rectangle", "to_world": _square(node), "bsdf": node["bsdf"]}
         elif kind.startswith("mrt_"):
             raise SceneError(
                 f"{name} has no counterpart among Mitsuba's plugins: {kind} is made of arrays, or a mesh to "
@@ -65,9 +52,11 @@ def _stock_bsdf(node: Node) -> Node:
     return {"type": "roughplastic", "distribution": "beckmann", **rough, **colors}
 
 
-def _facing(center: ArrayLike, normal: ArrayLike, half_size: float) -> mi.ScalarTransform4f:
-    """Return the transform that places Mitsuba's rectangle or disc, which has half size 1 and faces +z."""
-    ahead = np.divide(normal, np.linalg.norm(normal))
+def _square(plane: Node) -> mi.ScalarTransform4f:
+    """Return the transform of Mitsuba's rectangle, which has half size 1 and faces +z, into a plane."""
+    length = np.linalg.norm(plane["normal"])
+    ahead = np.divide(plane["normal"], length)
+    foot = np.multiply(-plane["distance"] / length, plane["normal"])
     up = [0, 0, 1] if abs(ahead[2]) < 0.9 else [1, 0, 0]
-    to_world = mi.ScalarTransform4f().look_at(np.array(center), np.add(center, ahead), up)
-    return to_world.scale([half_size, half_size, 1])
+    to_world = mi.ScalarTransform4f().look_at(foot, foot + ahead, up)
+    return to_world.scale([STOCK_EXTENT / 2, STOCK_EXTENT / 2, 1])
