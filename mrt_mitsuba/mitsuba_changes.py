@@ -30,6 +30,7 @@ Function = Callable[..., Any]
 # What an XML file has that names a plugin of ours, or may do so in a way that a search does not see: another
 # file, or a parameter
 HINTS = ("mrt_", "<include", 'type="$', "type='$")
+SOURCES = ("dict", "value", "path")  # names of the first parameter of Mitsuba's loaders
 
 
 #: held while Mitsuba is set up, and while it renders our plugins: there, neither it nor Dr.Jit is safe with
@@ -190,43 +191,34 @@ def dict_is_ours(scene: object) -> bool:
     return False
 
 
-def text_is_ours(text: object) -> bool:
-    """True if XML may have a plugin of ours."""
-    return isinstance(text, str) and any(hint in text for hint in HINTS)
-
-
-def file_is_ours(path: Any) -> bool:
-    """True if an XML file may have a plugin of ours."""
+def xml_is_ours(source: Any) -> bool:
+    """True if XML, or the file of this path, may have a plugin of ours."""
+    texts = [source]
     with contextlib.suppress(OSError, ValueError, TypeError):  # Mitsuba itself reports what cannot be read
-        name = str(mi.file_resolver().resolve(os.fspath(path)))
-        return os.path.isfile(name) and text_is_ours(Path(name).read_text(errors="ignore"))  # no device
-    return False
+        path = str(mi.file_resolver().resolve(os.fspath(source)))
+        if os.path.isfile(path):  # no device
+            texts.append(Path(path).read_text(errors="ignore"))
+    return any(hint in text for text in texts if isinstance(text, str) for hint in HINTS)
 
 
-def _loading(where: str, source: str, is_ours: Callable[[Any], bool]) -> Patch:
-    """Return the patch of a loader, whose first parameter is ``source``."""
+def load_serially(load: Function, /, *args: object, **given: object) -> object:
+    source = args[0] if args else next((given[name] for name in SOURCES if name in given), None)
+    values = [str(value) for name, value in given.items() if name not in SOURCES]  # of parameters
+    ours = any("mrt_" in value for value in values) or dict_is_ours(source) or xml_is_ours(source)
+    if ours and len(args) < 2:
+        given.setdefault("parallel", False)
+    with defer_signals() if ours else contextlib.nullcontext():
+        return load(*args, **given)
 
-    def load_serially(load: Function, /, *args: object, **given: object) -> object:
-        values = [value for name, value in given.items() if name not in (source, "optimize", "parallel")]
-        ours = any("mrt_" in str(value) for value in values) or is_ours(_argument(0, source, args, given))
-        if ours and len(args) < 2:
-            given.setdefault("parallel", False)
-        with defer_signals() if ours else contextlib.nullcontext():
-            return load(*args, **given)
 
-    return Patch(
-        where,
-        load_serially,
+for loader in ("mi.load_dict", "mi.load_string", "mi.load_file"):
+    patch(
+        loader,
         what="loads scenes with plugins of this project one object at a time, unless parallel= is given, and "
         "raises Ctrl-C afterwards",
         why="Mitsuba's parallel loader overflows the stack, or crashes, with hundreds of objects in Python, "
         "and turns a Ctrl-C in one into a RuntimeError",
-    )
-
-
-PATCHES.append(_loading("mi.load_dict", "dict", dict_is_ours))
-PATCHES.append(_loading("mi.load_string", "value", text_is_ours))
-PATCHES.append(_loading("mi.load_file", "path", file_is_ours))
+    )(load_serially)
 
 
 # -------------------------------------------- Light tracing --------------------------------------------

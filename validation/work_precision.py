@@ -24,8 +24,8 @@ from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import MrtError, MrtWarning, UsageError, needs_extra
 from mrt_mitsuba.options import is_path
 from mrt_mitsuba.rendering.api import Result, render
+from mrt_mitsuba.rendering.film import derived_seed
 from mrt_mitsuba.rendering.progress import Progress
-from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.scene.open import open_scene
 from mrt_mitsuba.validation import plotting
 from mrt_mitsuba.validation.compare import Array, compare, read_layer

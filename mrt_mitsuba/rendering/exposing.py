@@ -24,10 +24,9 @@ from mrt_mitsuba.filters.grid import dilated
 from mrt_mitsuba.interrupts import deliver_pending
 from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY
 from mrt_mitsuba.rendering.canvas import Canvas
-from mrt_mitsuba.rendering.film import Film, SamplePattern, divide, opaque
+from mrt_mitsuba.rendering.film import Film, SamplePattern, derived_seed, divide, opaque
 from mrt_mitsuba.rendering.plan import Pass
 from mrt_mitsuba.rendering.progress import Advance, Job
-from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.rendering.settings import FILM
 from mrt_mitsuba.rendering.shading import RayValues, Shader
 
@@ -400,7 +399,7 @@ class Exposer:
         rays = self.shader.values(start.picture, start.time, start.sampler)
         values = [] if self.film is None else self._film_values(rays)
         for name in self.planes:
-            values += _channels(TABLE[name].value(rays))
+            values += _channels(getattr(rays, name))
         return start.film, values
 
     def _film_values(self, rays: RayValues) -> list[mi.Float]:

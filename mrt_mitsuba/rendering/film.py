@@ -1,4 +1,4 @@
-"""Positions and times of camera samples, on a lattice or by a film's rules, and the film's filter."""
+"""Positions, times and seeds of camera samples, on a lattice or by a film's rules, and the film's filter."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import math
 import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
+from zlib import crc32
 
 import drjit as dr
 import mitsuba as mi
@@ -46,6 +48,17 @@ def divide(n: mi.UInt32, divisor: int) -> tuple[mi.UInt32, mi.UInt32]:
 @lru_cache(maxsize=64)
 def _array(variant: str, kind: str, number: float) -> mi.Float:
     return dr.opaque(getattr(mi, kind), number)
+
+
+def derived_seed(seed: Any, **parts: int) -> Any:
+    """Return the seed for a part of what ``seed`` decides, such as ``frame=2, refinement=1``.
+
+    Parts of different names or numbers draw independent numbers, and so do the same parts of another seed.
+    Parts with the number 0 are left out; where all are, ``seed`` itself comes back, which may then be a
+    Dr.Jit array. A sum such as ``seed + frame`` would give a frame the numbers of another seed's frame.
+    """
+    key = [n for name, part in sorted(parts.items()) if part for n in (crc32(name.encode()), part)]
+    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0]) if key else seed
 
 
 @dataclass(frozen=True)

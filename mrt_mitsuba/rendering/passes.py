@@ -19,9 +19,9 @@ from mrt_mitsuba.filters import dof, edges
 from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
 from mrt_mitsuba.plugins.signals import left_to_other_threads
 from mrt_mitsuba.rendering.exposing import FILM_PREFIX, Exposer, FilmAccumulator, RayBatch, widened
+from mrt_mitsuba.rendering.film import derived_seed
 from mrt_mitsuba.rendering.plan import Blur, Edges, Pass, Plan, Refinement, Rounds
 from mrt_mitsuba.rendering.progress import Advance, Job
-from mrt_mitsuba.rendering.seeds import derived_seed
 from mrt_mitsuba.rendering.settings import DETECTORS
 from mrt_mitsuba.rendering.shading import Shader
 

@@ -55,8 +55,8 @@ MAX_SPP = 4096  # mean samples per pixel, where a target alone would ask for mor
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
 
 
-class SharedOptions(TypedDict, total=False):
-    """The options of ``render`` that each render of a sweep may have, for type checkers."""
+class RenderOptions(TypedDict, total=False):
+    """The options of ``render`` as type checkers see them where a function takes ``**options``."""
 
     width: int | None
     height: int | None
@@ -90,11 +90,6 @@ class SharedOptions(TypedDict, total=False):
     spp: int | None
     count_rays: bool
     params: Mapping[str, Any] | None
-
-
-class RenderOptions(SharedOptions, total=False):
-    """The options of ``render`` as type checkers see them where a function takes ``**options``."""
-
     progress: Progress | None
 
 

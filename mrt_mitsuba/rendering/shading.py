@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -28,7 +29,7 @@ OF_FILMS = "RGBAW"  # channels of their own, a letter each
 
 
 class RayValues:
-    """Values along camera rays, read by the table of layers; computed only where a layer reads them.
+    """Values along camera rays by the names of layers, computed only where a layer is traced.
 
     ``valid``: whether the integrator found anything, Mitsuba's alpha; ``aovs``: its own channels;
     ``trace``: the result of an integrator with a ``kernel_plan``; None for any other, where Mitsuba finds the
@@ -44,7 +45,7 @@ class RayValues:
         valid: mi.Bool,
         *,
         aovs: Sequence[mi.Float] = (),
-        trace: Trace | None = None,
+        trace: Trace | Any = None,
     ) -> None:
         self.shader = shader
         self.ray = ray
@@ -68,23 +69,21 @@ class RayValues:
         """True where rays hit anything."""
         return self.si.is_valid()
 
-    def at_hit(self, kind: str, value: mi.Float, miss: float = 0) -> mi.Float:
-        """A value, as a type of Mitsuba's, where something is hit, and ``miss`` elsewhere."""
-        return dr.select(self.found, getattr(mi, kind)(value), miss)
-
-    def rgb(self, spectrum: mi.UnpolarizedSpectrum) -> mi.Color3f:
-        """The linear sRGB of a radiance along the rays, times the sensor's weight."""
-        return to_rgb(spectrum * self.weight, self.ray)
-
     @property
-    def distance(self) -> mi.Float:
+    def depth(self) -> mi.Float:
         """Distance of the first hit from the camera; along the ray where the sensor has no single origin."""
         sensor = self.shader.sensor
-        if sensor.class_name() not in ("PerspectiveCamera", "ThinLensCamera"):
-            return self.si.t
-        # not si.t: rays start at the near plane
-        eye = mi.Point3f(sensor.world_transform().translation()) + self.shader.shift(self.si.time)
-        return dr.norm(self.si.p - eye)
+        distance = self.si.t
+        if sensor.class_name() in ("PerspectiveCamera", "ThinLensCamera"):
+            # not si.t: rays start at the near plane
+            eye = mi.Point3f(sensor.world_transform().translation()) + self.shader.shift(self.si.time)
+            distance = dr.norm(self.si.p - eye)
+        return dr.select(self.found, distance, math.inf)
+
+    @property
+    def normal(self) -> mi.Vector3f:
+        """Geometric normal at the first hit; 0 for a miss."""
+        return dr.select(self.found, mi.Vector3f(self.si.n), 0)
 
     @property
     def albedo(self) -> mi.Color3f:
@@ -92,8 +91,35 @@ class RayValues:
         albedo = mi.UnpolarizedSpectrum(0)
         if not mi.variant().startswith("scalar") or self.found:
             bsdf = self.si.bsdf(mi.RayDifferential3f(self.ray))
-            albedo = bsdf.eval_diffuse_reflectance(self.si, self.found)
-        return to_rgb(self.at_hit("UnpolarizedSpectrum", albedo), self.ray)
+            albedo = mi.UnpolarizedSpectrum(bsdf.eval_diffuse_reflectance(self.si, self.found))
+        return to_rgb(dr.select(self.found, albedo, 0), self.ray)
+
+    @property
+    def square(self) -> mi.Color3f:
+        """Square of the picture."""
+        return self.image * self.image
+
+    # Of an integrator with a trace
+
+    @property
+    def direct(self) -> mi.Color3f:
+        """Linear sRGB without specular reflections, with the sensor's weight."""
+        return to_rgb(self.trace.direct * self.weight, self.ray)
+
+    @property
+    def reflection(self) -> mi.Color3f:
+        """Linear sRGB that specular reflections add, with the sensor's weight."""
+        return to_rgb((self.trace.radiance - self.trace.direct) * self.weight, self.ray)
+
+    @property
+    def bounces(self) -> mi.Float:
+        """Number of specular reflections."""
+        return self.trace.bounces
+
+    @property
+    def shadow_rays(self) -> mi.Float:
+        """Number of shadow rays."""
+        return self.trace.shadow_rays
 
 
 class Shader:

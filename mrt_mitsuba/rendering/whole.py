@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from mrt_mitsuba.adaptive.estimate import LUMINANCE
-from mrt_mitsuba.errors import SceneError, UsageError
+from mrt_mitsuba.errors import SceneError, UsageError, one_line
 from mrt_mitsuba.plugins.signals import left_to_other_threads
 from mrt_mitsuba.rendering.exposing import Exposer
+from mrt_mitsuba.rendering.film import derived_seed
 from mrt_mitsuba.rendering.progress import Advance
-from mrt_mitsuba.rendering.seeds import derived_seed
 
 
 def whole_picture(exposer: Exposer, seed: int, rays: int, advance: Advance) -> tuple[int, np.ndarray]:
@@ -37,8 +37,8 @@ def whole_picture(exposer: Exposer, seed: int, rays: int, advance: Advance) -> t
                 part = derived_seed(seed, wavefront=done)
                 shader.integrator.render(shader.scene, shader.sensor, seed=part, spp=count)
         except RuntimeError as error:  # such as an emitter that cannot be sampled
-            text = " ".join(str(error).split())
-            raise SceneError(f"the integrator {shader.name} cannot render this scene: {text}") from error
+            why = one_line(str(error))
+            raise SceneError(f"the integrator {shader.name} cannot render this scene: {why}") from error
         raw = np.array(shader.sensor.film().develop(raw=True), np.float64)  # whatever its pixel format
         place = 4 if film.alpha else 3
         weight = raw[..., place]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import hashlib
 import io
 import itertools
@@ -9,10 +10,10 @@ import operator
 import os
 import pickle
 import re
-from collections import ChainMap, Counter
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, SupportsIndex
+from typing import Any, NamedTuple, SupportsIndex
 
 import drjit as dr
 import mitsuba as mi
@@ -207,14 +208,12 @@ def encode(value: object) -> bytes:
     """
     import cloudpickle
 
-    transforms = [getattr(mi, name) for name in dir(mi) if name.endswith("Transform4f")]
-    own = {**dict.fromkeys(transforms, _transform_parts), mi.Bitmap: _bitmap_parts}
-
-    class Pickler(cloudpickle.Pickler):
-        dispatch_table: ClassVar[Any] = ChainMap(own, cloudpickle.Pickler.dispatch_table)
-
+    for name in dir(mi):
+        if name.endswith("Transform4f"):
+            copyreg.pickle(getattr(mi, name), _transform_parts)
+    copyreg.pickle(mi.Bitmap, _bitmap_parts)
     stream = io.BytesIO()
-    pickler = Pickler(stream, protocol=5)
+    pickler = cloudpickle.Pickler(stream, protocol=5)
     pickler.fast = True  # no references to what came before: they would distinguish equal from identical
     try:
         pickler.dump(value)

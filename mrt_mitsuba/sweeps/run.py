@@ -11,7 +11,7 @@ from mrt_mitsuba import runtime, user_plugins
 from mrt_mitsuba.errors import UsageError, needs_extra
 from mrt_mitsuba.files.replacing import make_folder
 from mrt_mitsuba.options import StrPath, Values, check, integer
-from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
+from mrt_mitsuba.rendering.progress import TerminalProgress
 from mrt_mitsuba.sweeps.folder import is_fresh, reserved
 from mrt_mitsuba.sweeps.jobs import check_parameters, jobs, points
 from mrt_mitsuba.sweeps.table import Table
@@ -20,7 +20,7 @@ from mrt_mitsuba.sweeps.worker import describe
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from mrt_mitsuba.rendering.settings import SharedOptions
+    from mrt_mitsuba.rendering.settings import RenderOptions
 
 
 def sweep(  # noqa: PLR0913 - each option has a name that editors show
@@ -34,8 +34,7 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
     retries: int = 2,
     resume: bool = True,
     plugins: Any = (),
-    progress: Progress | None = None,
-    **options: Unpack[SharedOptions],
+    **options: Unpack[RenderOptions],
 ) -> Table:
     """Render every combination of a grid's values on several processes or machines.
 
@@ -55,8 +54,8 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
         resume: keep the pictures that are whole and were made with the same settings and versions.
         plugins: Python files or names of modules with plugins of your own, imported here and by each
             worker.
-        progress: receives how far it is; by default shown on a terminal and in notebooks.
-        options: arguments of ``render`` that all jobs share.
+        options: arguments of ``render`` that all jobs share; ``progress`` receives how far the sweep is, by
+            default shown on a terminal and in notebooks.
 
     Raises:
         UsageError, SceneError, OutputError: for a sweep that cannot be, before anything is rendered; also for
@@ -76,7 +75,7 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
         options.setdefault("variant", current)  # workers use the variant that ``render`` would
     named = points({} if grid is None else grid, zipped)
     folder = make_folder(out)
-    shown = TerminalProgress(unit=" pictures") if progress is None else progress
+    shown = options.pop("progress", None) or TerminalProgress(unit=" pictures")
     modules = user_plugins.plugin_names(plugins)
     with reserved(folder):
         runtime.use()  # values may hold its types

@@ -36,7 +36,6 @@ class Table:
         self.keys = tuple(next(iter(points.values()), ()))
         self._points = points
         self._ended: dict[str, Facts] = {}
-        self._jobs: dict[str, Job] = {}
         self._path = os.path.join(folder, "table.csv")
         self._written = 0.0
         check_target(self._path)
@@ -77,21 +76,27 @@ class Table:
             raise UsageError(
                 text if self.failed else "mean: one picture has no spread: give two seeds or more"
             )
-        return mean_of_seeds(self.folder, next(iter(self._jobs.values())), done)
+        return mean_of_seeds(self.folder, self._job, done)
 
     def add(self, job: Job, facts: Facts) -> None:
         """Add the row of a job that ended; ``write`` follows at most once a second."""
-        name = job.name
-        self._jobs[name] = job
-        self._ended[name] = {**self._points[name], **dict.fromkeys(FACTS), "file": "", "error": "", **facts}
+        self._job = job  # any of them: what they share is that of the mean
+        self._ended[job.name] = {
+            **self._points[job.name],
+            **dict.fromkeys(FACTS),
+            "file": "",
+            "error": "",
+            **facts,
+        }
         if time.monotonic() > self._written + PAUSE:
             self.write()
 
     def write(self) -> None:
         """Write the file, which replaces the one before when it is complete."""
         text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerows([(*self.keys, *FACTS), *(map(_cell, row.values()) for row in self.rows)])
+        writer = csv.DictWriter(text, (*self.keys, *FACTS), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({name: _cell(value) for name, value in row.items()} for row in self.rows)
         with replacing(self._path) as (file,):
             file.write(text.getvalue().encode())
         self._written = time.monotonic()
@@ -109,11 +114,10 @@ def _read(path: str) -> dict[str, Facts]:
     if not os.path.exists(path):
         return facts
     with suppress(OSError, ValueError, csv.Error), open(path, encoding="utf-8", newline="") as file:
-        head, *rows = (row[-len(FACTS) :] for row in csv.reader(file) if row)  # after the values of axes
-        if head == [*FACTS]:
-            for row in rows:
-                texts = zip(FACTS, row, strict=True)
-                known = {name: FACTS[name](text) for name, text in texts if text}
-                facts[known.get("file", "")] = {"file": ""} | known
+        reader = csv.DictReader(file)
+        if FACTS.keys() <= {*(reader.fieldnames or ())}:
+            for row in reader:
+                known = {name: kind(row[name]) for name, kind in FACTS.items() if row[name]}
+                facts[row["file"]] = {"file": ""} | known
             return facts
     raise OutputError(f"{path} is not the table of a sweep: move it away, or choose another folder")

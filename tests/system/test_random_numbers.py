@@ -11,7 +11,7 @@ from cases import Cases
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.machine import Workspace
-from mrt_mitsuba.rendering.seeds import derived_seed
+from mrt_mitsuba.rendering.film import derived_seed
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mrt_mitsuba import runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.rendering.seeds import derived_seed
+from mrt_mitsuba.rendering.film import derived_seed
 from mrt_mitsuba.validation.bsdf_probe import evaluate, lobe_pairs, relative_error
 from mrt_mitsuba.validation.compare import compare, p_values
 from mrt_mitsuba.validation.laws.probe import is_scalar
