@@ -338,6 +338,19 @@ def test_a_checked_plugin_is_named_and_let_go(answer, loaded):
         gc.enable()
 
 
+def test_a_value_in_lanes_that_eval_alone_does_not_switch_off_is_found():
+    class Careless(power.changed_bsdf({})):
+        def eval(self, ctx, si, wo, active=True):
+            return self.nested.eval(ctx, si, wo)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return self.nested.eval_pdf(ctx, si, wo, active)
+
+    mi.register_bsdf("careless", Careless)
+    given = {"type": "careless", "change": "", "nested": {"type": "diffuse"}}
+    assert exceeded(mrt.check_bsdf(given, quick=True, only=["eval_pdf"])) == {"eval_pdf.inactive"}
+
+
 def test_a_bsdf_without_a_method_of_its_own_fails():
     class Bare(mi.BSDF):
         def __init__(self, props):

@@ -57,6 +57,14 @@ def test_look_up_is_the_report_s(picture, variant):
         assert_allclose(got, expected(values, u, v), atol=1e-7)
 
 
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"], indirect=True)
+def test_means_are_as_bright_as_pictures(variant):
+    """Also above 1, where textures of spectra end."""
+    one, two = (mi.Bitmap(np.full((2, 2, 3), value, np.float32)) for value in (1.5, 3))
+    means = [mi.load_dict({"type": "mrt_texture", "bitmap": bitmap}).mean() for bitmap in (one, two)]
+    assert_allclose(means[1], 2 * np.array(means[0]), rtol=1e-6)
+
+
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGBA"])
 def test_other_kinds_of_pictures(tmp_path, mode):
     values = np.tile(np.array([[0, 80], [160, 240]], np.uint8)[:, :, None], (1, 1, 3))
