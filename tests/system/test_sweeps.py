@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterator
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -29,6 +30,8 @@ from mrt_mitsuba.errors import MrtError, OutputError, UsageError
 from mrt_mitsuba.files.images import read_exr
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.sweeps import worker
+from mrt_mitsuba.sweeps.jobs import encode
 
 distributed = pytest.importorskip("distributed")
 Client = distributed.Client
@@ -251,6 +254,19 @@ wrong_options("plugins=none.py: no such Python file", plugins="none.py")
 wrong_options("workers=0: must be a whole number", workers=0)
 wrong_options("give one of them", workers=2, cluster=NOWHERE)
 wrong_options("no scheduler with workers answers at nonsense://x", cluster="nonsense://x")
+
+
+def test_workers_that_share_cores_divide_them(tmp_path, monkeypatch):
+    """Sixteen of them among four."""
+    here = worker.describe(str(tmp_path))
+    known = SimpleNamespace(address="here", memory_manager=SimpleNamespace(memory_limit=0))
+    monkeypatch.setattr("distributed.get_worker", lambda: known)
+    monkeypatch.setattr(worker, "usable_cores", lambda: 16)
+    monkeypatch.setattr(worker, "_render", lambda *_: {})
+    threads: list[int] = []
+    monkeypatch.setattr(dr, "set_thread_count", threads.append)
+    worker.render_job(encode(None), "", here["versions"], {here["cores"]: 4}, (), None)
+    assert threads == [4]
 
 
 @pytest.mark.parametrize(("grid", "options", "message"), wrong)
