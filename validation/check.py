@@ -102,7 +102,7 @@ def check_emitter(
     """Check the laws of an emitter; see ``check_bsdf``. A dict may also be of a shape with an emitter.
 
     ``scene``: the one that a loaded emitter belongs to; else it lights a sphere of radius 1, and what lights
-    from a surface does so from a square above it.
+    from a surface does so from a square.
     """
     runtime.use()
     with _with_our_errors():

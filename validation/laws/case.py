@@ -71,13 +71,8 @@ class Case:
         return mi.load_dict(_made(self.with_(**changes)))
 
     def scene(self, **changes: object) -> mi.Scene:
-        """Load a scene that holds the shape alone, or an instance with its group. Raises ``Skip`` as well."""
-        given = self.with_(**changes)
-        nodes = {"shape": given}
-        for key, value in given.items():
-            if given["type"] == "instance" and isinstance(value, dict) and value["type"] == "shapegroup":
-                nodes = {"group": value, "shape": {**given, key: {"type": "ref", "id": "group"}}}
-        return mi.load_dict({"type": "scene", **_made(nodes)})
+        """Load a scene that holds the shape alone. Raises ``Skip`` as well."""
+        return mi.load_dict({"type": "scene", "shape": self.load(**changes)})
 
     def units(self, count: int) -> Array:
         """Random directions [count, 3], uniform over the sphere."""

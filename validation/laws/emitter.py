@@ -16,11 +16,11 @@ from .examine import TIMEOUT, examine
 from .faults import DEGREE, PLACE, larger, no_number, put
 from .law import (
     SIGMAS,
-    SIGNIFICANCE,
     Outcome,
     Skip,
     UsageError,
     by_name,
+    difference,
     finds,
     measures,
     most,
@@ -33,20 +33,16 @@ from .shape_case import CONE, View, alone
 from .sphere import (
     SMALL_CELL_LEVEL,
     Cells,
-    chances_of,
     encode,
     hold_small,
-    p_value_of_least,
+    integrate,
 )
 
 REEVALUATION_TOL = 1e-3  # relative: the same formula, evaluated once more
 DIRECTION_TOL = 4 * probe.DIRECTION_EPS  # a direction passes through angles, a transform, and back
 SPOILS = "one such number spoils a picture"
 LENGTH_TOL = 1e-4  # relative: a square root, and the difference of two points
-RETRY_P_VALUE = 1e-3  # chance below which the integral over a cell is computed again
 ENDS = (0, 0.5, 1 - 2.0**-24)  # and the middle
-REPEATS = 64
-BATCH = 256  # cells that are computed again at a time
 MAX_UNSAMPLED_LIGHT = 5e-5  # share of the light: a fifth of a cone of 3 degrees
 
 
@@ -57,9 +53,6 @@ print("the point:", ds.p, "and by direction and distance:", it.p + ds.dist * ds.
 it.wi = -ds.d
 print("eval(), if it is infinitely far:", emitter.eval(it))
 """
-BALL = '"ball": {"type": "sphere"}, "light": emitter'
-SQUARE = '"square": {"type": "rectangle", "to_world": place, "light": emitter}'
-PLACED = "place = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 180)"
 
 
 def check_emitter(
@@ -74,7 +67,7 @@ def check_emitter(
     """Check the laws of an emitter in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
     ``scene``: the one that a loaded emitter belongs to; else it lights a sphere of radius 1, and what lights
-    from a surface does so from a square above it. A dict may also be of a shape with an emitter. ``quick``:
+    from a surface does so from a square. A dict may also be of a shape with an emitter. ``quick``:
     fewer samples. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law fails that is not done.
     Raises ``UsageError`` for anything else, and ``LoadError`` for a dict that Mitsuba cannot load.
     """
@@ -89,59 +82,38 @@ class EmitterCase(Case):
 
     def __init__(self, given: Given, quick: bool, seed: int, scene: mi.Scene | None = None) -> None:
         super().__init__(given, quick, seed)
-        self.is_shape = isinstance(self.plugin, mi.Shape) and self.plugin.emitter() is not None
-        if self.is_shape:
+        if self.description and isinstance(self.plugin, mi.Emitter) and self._has(mi.EmitterFlags.Surface):
+            self.description = {"type": "rectangle", "light": self.description}  # some surface to light from
+            self.plugin = self.load()
+        nodes = '"ball": {"type": "sphere"}, "light": emitter'
+        if isinstance(self.plugin, mi.Shape) and self.plugin.emitter() is not None:
+            nodes = '"shape": emitter'
             scene = mi.load_dict({"type": "scene", "shape": self.plugin})
             self.plugin = self.plugin.emitter()
         if not isinstance(self.plugin, mi.Emitter):
             kind = type(self.plugin).__name__
             raise UsageError(f"{kind} is not an emitter of {mi.variant()}: give a dict or a loaded emitter")
-        self.lit = scene or self._lit_sphere()  # an emitter keeps neither its scene nor its shape alive
+        if scene is None and self._has(mi.EmitterFlags.Surface):
+            fix = "give the scene that it belongs to, or a dict of its shape"
+            raise UsageError(f"the {self.name} cannot light a scene of its own: {fix}")
+        # an emitter keeps neither its scene nor its shape alive
+        self.lit = scene or mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "light": self.plugin})
+        #: lines of a program that put the emitter into a scene
+        self.placed = "# it is in a scene"
+        if self.description is not None:
+            self.placed = f'scene = mi.load_dict({{"type": "scene", {nodes}}})\n(emitter,) = scene.emitters()'
         # of a scene without shapes, the box is empty
         low, high = np.sort(np.nan_to_num(probe.corners(self.lit), posinf=1, neginf=-1), axis=0)
         size = float(norm(high - low))
         outer = 0.1 * size  # also across a flat box
         self.points = np.float32(self.rng.uniform(low - outer, high + outer, (2**12, 3)))
-        self._look_from_the_light(size)
-        flags = self.plugin.flags()
-        delta = mi.has_flag(flags, mi.EmitterFlags.Delta) or mi.has_flag(
-            flags, mi.EmitterFlags.DeltaDirection
-        )
         # whether light comes from all around, or from a surface, and not from single directions or a point
-        self.around = mi.has_flag(flags, mi.EmitterFlags.Infinite) and not delta
-        self.lamp = mi.has_flag(flags, mi.EmitterFlags.Surface) and not delta
+        delta = self._has(mi.EmitterFlags.Delta)
+        self.around = self._has(mi.EmitterFlags.Infinite) and not delta
+        self.lamp = self._has(mi.EmitterFlags.Surface) and not delta
 
-    def _lit_sphere(self) -> mi.Scene:
-        """A scene with the emitter and a sphere; what lights from a surface lights from a square."""
-        nodes = {"type": "scene", "ball": {"type": "sphere"}}
-        if mi.has_flag(self.plugin.flags(), mi.EmitterFlags.Surface):
-            place = mi.ScalarTransform4f().translate([0, 0, 2]).rotate([1, 0, 0], 180)
-            nodes["square"] = {"type": "rectangle", "to_world": place, "light": self.plugin}
-        else:
-            nodes["light"] = self.plugin
-        try:
-            return mi.load_dict(nodes)
-        except RuntimeError as error:
-            fix = "give the scene that it belongs to, or a dict of its shape"
-            raise UsageError(f"the {self.name} cannot light a scene of its own: {fix}") from error
-
-    def _look_from_the_light(self, size: float) -> None:
-        """Look from half of the points along rays that the emitter sends out: it may light few others."""
-        half = len(self.points) // 2
-        u = self.uniform(half, 5)
-        reach = (size * self.rng.uniform(0.1, 1, half)).astype(np.float32)
-
-        def along(time: mi.Float, place: mi.Point2f, way: mi.Point2f, reach: mi.Float) -> mi.Point3f:
-            ray, _ = self.plugin.sample_ray(0, time, place, way)
-            return ray.o + reach * ray.d
-
-        columns = ("Float", u[:, 0]), ("Point2f", u[:, 1:3]), ("Point2f", u[:, 3:]), ("Float", reach)
-        try:
-            (points,) = lanes(along, *columns)
-        except Exception:  # none of its laws asks for rays
-            return
-        usable = np.isfinite(points).all(axis=1)
-        self.points[:half][usable] = points[usable]
+    def _has(self, flag: mi.EmitterFlags) -> bool:
+        return bool(mi.has_flag(self.plugin.flags(), flag))
 
     @cached_property
     def samples(self) -> Lanes:
@@ -203,19 +175,6 @@ class EmitterCase(Case):
             return [si.is_valid(), si.t, seen(si), light(it, ds)]
 
         return lanes(call, ("Point3f", o), ("Vector3f", d))
-
-    @cached_property
-    def placed(self) -> str:
-        """Lines of a program that put the emitter into a scene."""
-        if self.description is None:
-            return "# it is in a scene"
-        place = ""
-        nodes = '"shape": emitter' if self.is_shape else BALL
-        if not self.is_shape and mi.has_flag(self.plugin.flags(), mi.EmitterFlags.Surface):
-            place = PLACED
-            nodes = SQUARE
-        scene = 'scene = mi.load_dict({"type": "scene", ' + nodes + "})"
-        return "\n".join([place, scene, "(emitter,) = scene.emitters()"])
 
     @cached_property
     def surface(self) -> mi.Scene:
@@ -343,44 +302,27 @@ def _by_samples_and_by_rays(case: EmitterCase) -> float:
     o = view.around(case, case.count(2**17, 2**19))
     met, _, value, _ = case.met(o, view.into_cone(o, case.rng))
     by_rays = np.where(met, probe.finite_or_0(value).sum(axis=1) * CONE, 0)
-    means = by_samples.mean(), by_rays.mean()
-    error = np.hypot(by_samples.std() / len(by_samples) ** 0.5, by_rays.std() / len(by_rays) ** 0.5)
-    return float(max(abs(means[0] - means[1]) - SIGMAS * error, 0) / max(*means, 1e-30))
+    return difference(by_samples, by_rays)
 
 
 def _in_small_cells(law: Outcome, case: EmitterCase) -> None:
     """Directions in cells and in slices of a degree, coarser in scalar variants: for places never sampled."""
     count = 2**12 if probe.is_scalar() else case.count(2**21, 2**23)
     cells = Cells.uniform(3 if probe.is_scalar() else SMALL_CELL_LEVEL)
-    rng = np.random.default_rng((case.seed, 3))
-    seen = np.zeros(len(cells.start))
     wave = min(count, 2**20)
+    codes = []
     for _ in range(count // wave):
-        seen += cells.counts(encode(_directions(case, rng.random((wave, 2), np.float32))))
-    counts = np.array([seen, *cells.expected(case.density, count, rng)])
-    # a corner of a bright texel may lie between the points of a cell
-    (doubtful,) = np.nonzero(chances_of(counts, REEVALUATION_TOL) < RETRY_P_VALUE)
-    for first in range(0, len(doubtful), BATCH):
-        batch = doubtful[first : first + BATCH]
-        again = np.array(cells[np.tile(batch, REPEATS)].expected(case.density, count, rng))
-        counts[1:, batch] = again.reshape(2, REPEATS, -1).mean(axis=1)
-        if p_value_of_least(chances_of(counts[:, batch], REEVALUATION_TOL), len(counts[0])) < SIGNIFICANCE:
-            break  # the law fails, whatever the other cells hold: half of the sky would take half a minute
-    hold_small(law, cells, counts, REEVALUATION_TOL)
-
-
-def _directions(case: EmitterCase, u: Array) -> Array:
-    """Sampled directions from one point, by random numbers [N, 2], without those refused in the light."""
-
-    def call(u: mi.Point2f) -> list[mi.Float]:
-        it = case.from_first()
-        ds, weight = method(case.plugin, "sample_direction")(it, u)
-        weight = mi.unpolarized_spectrum(weight)
-        value = mi.unpolarized_spectrum(method(case.plugin, "eval_direction")(it, ds))
-        return [ds.d, dr.all(weight == 0) & dr.any(value > 0)]
-
-    d, refused = lanes(call, ("Point2f", u))
-    return d[~refused]
+        s = case.sample(np.broadcast_to(case.points[0], (wave, 3)))
+        refused = ~s.lit & (s.value > 0).any(axis=1)
+        codes.append(encode(s.d[~refused]))
+    every = np.concatenate(codes)
+    fine = integrate(case.density, cells, np.random.default_rng((case.seed, 3)), every, count)
+    parent = cells.find(fine.start)
+    mean = np.bincount(parent, fine.mean)
+    variance = np.bincount(parent, fine.variance)
+    hold_small(
+        law, cells, np.array([cells.counts(every), count * mean, count**2 * variance]), REEVALUATION_TOL
+    )
 
 
 @finds("weight", "weight of a sample too large", 3e-3, weight=larger)

@@ -75,6 +75,13 @@ def sidak(p: float, count: int) -> float:
     return 1.0 if p >= 1 else float(-np.expm1(count * np.log1p(-p)))
 
 
+def difference(one: np.ndarray, other: np.ndarray) -> float:
+    """The difference of the means of two samples [N] and [M], beyond chance, relative to the larger mean."""
+    error = np.sqrt(one.var() / len(one) + other.var() / len(other))
+    means = one.mean(), other.mean()
+    return float(max(abs(means[0] - means[1]) - SIGMAS * error, 0) / max(*means, 1e-30))
+
+
 @dataclass(frozen=True)
 class Fault:
     """A fault, and the smallest size that a check finds, in full and ``quick``; infinity for none."""

@@ -101,17 +101,6 @@ def at_wavelengths(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     return si
 
 
-def _fits(value: object, kind: str) -> bool:
-    """True if Mitsuba converts a value to a type of the current variant."""
-    if kind not in ("Spectrum", "Float"):
-        return isinstance(value, getattr(mi, kind))
-    if not dr.is_array_v(value):
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return bool(dr.is_arithmetic_v(value)) and (
-        kind == "Spectrum" or dr.depth_v(value) <= dr.depth_v(mi.Float)
-    )
-
-
 def _cast(value: object, kind: str) -> Any:
     """Return a value as Mitsuba converts it: a number also counts as a color."""
     wanted = getattr(mi, kind)
@@ -128,10 +117,11 @@ def method(plugin: mi.Object, name: str) -> Call:
         answer = getattr(plugin, name)(*given, mi.Bool(active))
         kinds = RETURNS[name]
         parts = answer if isinstance(answer, tuple | list) else (answer,)
-        if len(parts) != len(kinds) or not all(map(_fits, parts, kinds)):
+        try:
+            taken = [_cast(part, kind) for part, kind in zip(parts, kinds, strict=True)]
+        except (TypeError, ValueError) as problem:
             what = ", ".join(type(part).__name__ for part in parts)
-            raise TypeError(f"{name}() returned {what}: it must return {', '.join(kinds)}")
-        taken = [_cast(part, kind) for part, kind in zip(parts, kinds, strict=True)]
+            raise TypeError(f"{name}() returned {what}: it must return {', '.join(kinds)}") from problem
         return taken if len(kinds) > 1 else taken[0]
 
     return call

@@ -28,7 +28,7 @@ MAX_HIT_ROUNDINGS = 64  # of the largest number in a ray: some dozen operations
 MAX_MEDIAN_ROUNDINGS = 16  # roundings: twice the most that was measured of sound shapes
 FAR_DISTANCE = 1e4  # sizes away
 UNSCALED = ("BSplineCurve", "LinearCurve", "Ellipsoids", "EllipsoidsMesh")  # to_world leaves their radii
-SMOOTHED = ("SDFGrid", "BSplineCurve", "LinearCurve", "Instance")
+SMOOTHED = ("SDFGrid", "BSplineCurve", "LinearCurve")
 
 RAY = """si = scene.ray_intersect(mi.Ray3f(o, d))
 print(si)
@@ -122,10 +122,8 @@ class ShapeCase(Case):
             raise UsageError(f"{kind} is not a shape of {mi.variant()}: give a dict or a loaded shape")
         self.target = self.plugin
         if class_name(self.plugin) == "Instance":
-            if self.description is None:
-                raise UsageError("a loaded instance does not give its group away: give a dict of both")
-            self.target = self.scene()
-        elif isinstance(self.plugin, mi.Shape):
+            raise UsageError("an instance has no surface of its own: check the shapes of its group")
+        if isinstance(self.plugin, mi.Shape):
             self.target = alone(self.plugin)
         self.box = corners(self.plugin)
         if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():

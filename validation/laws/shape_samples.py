@@ -15,6 +15,7 @@ from .law import (
     SIGMAS,
     Criterion,
     Outcome,
+    difference,
     finds,
     measures,
     most,
@@ -220,12 +221,9 @@ def _area(law: Outcome, case: ShapeCase, s: Lanes, area: float) -> None:
     law.check("crossings", beyond / area, limit=room)
     # crossings of a line come together
     size = 1 / (1 / len(s.p) + (crossed**2).sum() / crossed.sum() / len(crossings))
-    axes = case.units(AXES)
-    apart = [_distance(s.p @ axis, crossings @ axis) for axis in axes]
-    for axis in np.eye(3):
-        widths = np.linalg.svd(np.cov((crossings @ null_space(axis[None])).T), compute_uv=False)
-        if widths[1] >= 1e-4 * widths[0]:  # else in one plane with the axis: azimuths around it are but two
-            apart.append(_distance(_angle(s.p - case.middle, axis), _angle(crossings - case.middle, axis)))
+    apart = []
+    for axis in case.units(AXES):
+        apart += _apart(s.p - case.middle, crossings - case.middle, axis)
     law.check("spread", _chance(apart, size))
 
 
@@ -234,10 +232,13 @@ GRAZING_ALLOWANCE = 2e-3  # lines that graze are left room for
 VIEWS = 3  # from which directions are compared
 
 
-def _angle(v: Array, axis: Array) -> Array:
-    """Azimuths [N] of vectors [N, 3] around an axis [3]."""
-    x, y = (v @ null_space(axis[None])).T
-    return np.arctan2(y, x)
+def _apart(v: Array, w: Array, axis: Array, weight: Array | None = None) -> list[float]:
+    """Distances of the distributions of vectors [N, 3] and [M, 3] along an axis and in azimuth around it."""
+    across = null_space(axis[None])
+    return [
+        _distance(v @ axis, w @ axis, weight),
+        _distance(np.arctan2(*(v @ across).T), np.arctan2(*(w @ across).T), weight),
+    ]
 
 
 def _distance(x: Array, y: Array, weight: Array | None = None) -> float:
@@ -281,15 +282,7 @@ def _directions(law: Outcome, case: ShapeCase) -> None:
     law.check("direction", abs(pdf / again - 1), met, where=drawn)
     before_it = met.steep & (met.t > dist * (1 + 1e-3))
     law.check("misses", before_it | ~met.met, met, where=drawn)
-    by_samples = _visible(dist, pdf, met)
-    # the same by uniform directions into the cone that holds the shape
-    o = case.around(case.count(2**17, 2**19))
-    by_cone = np.where(trace(case.target, o, case.view.into_cone(o, case.rng)).met, CONE, 0)
-    error = np.sqrt(by_samples.var() / len(by_samples) + by_cone.var() / len(by_cone))
-    off = abs(by_samples.mean() - by_cone.mean()) - SIGMAS * error
-    law.check("angle", max(off, 0) / by_cone.mean())
-    if len(u) >= 2**12:
-        law.check("aim", _aim(case, case.count(2**17, 2**19)))
+    _aim(law, case)
 
 
 def _sampled(case: ShapeCase, o: Array, u: Array) -> list[Array]:
@@ -304,30 +297,29 @@ def _sampled(case: ShapeCase, o: Array, u: Array) -> list[Array]:
     return lanes(sample, ("Point3f", o), ("Point2f", u))
 
 
-def _visible(dist: Array, pdf: Array, met: Lanes) -> Array:
-    """The solid angle that each sampled direction stands for, 0 where its point is hidden. [N]"""
-    visible = (pdf > 0) & met.met & (met.t > dist * (1 - 1e-3))
-    return np.where(visible, 1 / np.where(pdf > 0, pdf, 1), 0)
-
-
-def _aim(case: ShapeCase, count: int) -> float:
-    """The chance of such samples of directions from some places, if their density is as stated."""
+def _aim(law: Outcome, case: ShapeCase) -> None:
+    """Directions from some places: their density, and the solid angle of what is visible."""
+    count = case.count(2**17, 2**19)
     rng = np.random.default_rng((case.seed, count))
     apart = []
+    angles = []
     size = np.inf
     for _ in range(VIEWS):
         place = np.float32(case.middle + 1.5 * case.size * unit(rng.normal(size=3)))
         o = np.tile(place, (count, 1))
         d, dist, pdf, _ = _sampled(case, o, rng.random((count, 2), np.float32))
-        weight = _visible(dist, pdf, trace(case.target, o, d))
+        met = trace(case.target, o, d)
+        visible = (pdf > 0) & met.met & (met.t > dist * (1 - 1e-3))
+        weight = np.where(visible, 1 / np.where(pdf > 0, pdf, 1), 0)
         away = case.view.into_cone(o, rng)
-        seen = away[trace(case.target, o, away).met]
+        within = trace(case.target, o, away).met
+        angles.append(difference(weight, CONE * within))
         fewest = count // 16
-        if len(seen) < fewest or np.count_nonzero(weight) < fewest:  # seen edge on
+        if np.count_nonzero(within) < fewest or np.count_nonzero(weight) < fewest:  # seen edge on
             continue
         effective = weight.sum() ** 2 / (weight**2).sum()
-        size = min(size, 1 / (1 / effective + 1 / len(seen)))
-        axis = unit(case.middle - place)
-        apart.append(_distance(d @ axis, seen @ axis, weight))
-        apart.append(_distance(_angle(d, axis), _angle(seen, axis), weight))
-    return _chance(apart, size) if apart else 1.0
+        size = min(size, 1 / (1 / effective + 1 / np.count_nonzero(within)))
+        apart += _apart(d, away[within], unit(case.middle - place), weight)
+    law.check("angle", angles)
+    if apart:
+        law.check("aim", _chance(apart, size))
