@@ -425,12 +425,12 @@ TURN = np.array([[0.8, -0.6, 0], [0.48, 0.64, -0.6], [0.36, 0.48, 0.8]])  # in s
 OFFSET = np.array([0.5, -1, 2])  # in sizes
 
 
-def _alike(law: Outcome, seen: Lanes, there: Lanes, **names: object) -> None:
+def _alike(law: Outcome, seen: Lanes, there: Lanes) -> None:
     """Check hits elsewhere against those that they should equal."""
-    law.check("answer", there.met != seen.met, seen, where=seen.clear, **names)
+    law.check("answer", there.met != seen.met, seen, where=seen.clear)
     distance = abs(there.t - seen.t) / (abs(there.o).max(axis=1) + seen.t)
     error = np.maximum(distance, 1 - dot(there.n, seen.n)) / ROUNDING
-    law.check("off", error, seen, where=there.met & seen.steep, **names)
+    law.check("off", error, seen, where=there.met & seen.steep)
 
 
 @measures(
@@ -466,7 +466,8 @@ def scale(law: Outcome, case: ShapeCase) -> None:
         start = np.float32(seen.o @ place[:3, :3].T + place[:3, 3])
         there = trace(scene, start, way)
         there = there.having(t=there.t / 2.0**power, o=there.o / 2.0**power, n=there.n @ TURN)
-        _alike(law, seen, there, power=power, matrix=to_world.tolist(), start=start, way=way)
+        names = {"power": power, "matrix": to_world.tolist(), "start": start, "way": way}
+        _alike(law, Lanes(**vars(seen), **names), there)
 
 
 TWICE = """for o in (o, mi.Point3f({other})):
@@ -613,4 +614,4 @@ def variants(law: Outcome, case: ShapeCase) -> None:
     other = case.other_kind
     seen = case.few(case.seen, 500, 2000)
     there = case.elsewhere(other, lambda: trace(case.scene(), seen.o, seen.d))
-    _alike(law, seen, there, other=other)
+    _alike(law, Lanes(**vars(seen), other=other), there)
