@@ -12,7 +12,7 @@ import numpy as np
 
 from . import probe
 from .case import Case, Given
-from .law import Skip, UsageError
+from .law import Skip
 from .probe import DIRECTION_EPS, Array, Lanes, Probe, excess, joined, unit
 
 ANGLES = (0, 20, 45, 60, 75, 85, 89, 110, 150)  # of incidence, in degrees; beyond 90 from below
@@ -29,9 +29,7 @@ class BsdfCase(Case, Probe):
     def __init__(self, given: Given, quick: bool, seed: int) -> None:
         Case.__init__(self, given, quick, seed)
         Probe.__init__(self, self.plugin)
-        if not isinstance(self.plugin, mi.BSDF):
-            kind = type(self.plugin).__name__
-            raise UsageError(f"{kind} is not a BSDF of {mi.variant()}: give a dict or a loaded BSDF")
+        self.need("a BSDF", isinstance(self.plugin, mi.BSDF))
 
     @property
     def angles(self) -> tuple[int, ...]:

@@ -42,6 +42,7 @@ from .sphere import (
     SMALL_CELL_LEVEL,
     Cells,
     chi_square,
+    compared,
     encode,
     hold_small,
     integrate,
@@ -236,9 +237,8 @@ def _in_small_cells(law: Outcome, case: BsdfCase, views: list[Lanes]) -> None:
     cells = Cells.uniform(SMALL_CELL_LEVEL)
     counts = []
     for view in views:
-        seen = cells.counts(encode(view.wo[view.density > 0]))
-        expected = cells.expected(_density_at(case, view), len(view.density), case.rng)
-        counts.append([seen, *expected])
+        codes = encode(view.wo[view.density > 0])
+        counts.append(compared(cells, _density_at(case, view), codes, len(view.density), case.rng))
     hold_small(law, cells, np.sum(counts, axis=0), G1_FIT_ERROR, views[0][0])
 
 

@@ -14,13 +14,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .law import LoadError, Outcome, Skip
+from .law import LoadError, Outcome, Skip, UsageError
 from .probe import Array, Lanes, is_scalar, unit
 
 Description = dict[str, Any]  # of a plugin, as ``mi.load_dict`` takes it
 Given = Any  # such a dict, a value of one, or a loaded plugin
 Result = TypeVar("Result")
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
+ENDS = (0, 2.0**-24, 0.5, 1 - 2.0**-24)  # of random numbers, and the middle
 WAVE = 2**20  # lanes that are checked at a time for results that are not finite
 # By package, lines of a program that register its plugins: the first before Mitsuba is imported
 PREAMBLES: dict[str, tuple[str, str]] = {}
@@ -60,6 +61,12 @@ class Case:
             self.name = class_name(given)
             self.plugin = given
 
+    def need(self, kind: str, fits: bool) -> None:
+        """Raise ``UsageError`` for a plugin that is of another kind."""
+        if not fits:
+            what = f"{type(self.plugin).__name__} is not {kind} of {mi.variant()}"
+            raise UsageError(f"{what}: give a dict or a loaded one")
+
     def with_(self, **changes: object) -> Description:
         """The dict with other values of some parameters. Raises ``Skip`` without one."""
         if self.description is None:
@@ -80,6 +87,11 @@ class Case:
 
     def uniform(self, *size: int) -> Array:
         return self.rng.random(size, np.float32)
+
+    def numbers(self, *size: int, extreme: float) -> Array:
+        """Random numbers, of which a share is at the ends of their range, or in its middle."""
+        ends = self.rng.choice(ENDS, size)
+        return np.float32(np.where(self.rng.random(size) < extreme, ends, self.uniform(*size)))
 
     def count(self, quick: int, full: int) -> int:
         """The number of lanes to use."""

@@ -33,16 +33,15 @@ from .shape_case import CONE, View, alone
 from .sphere import (
     SMALL_CELL_LEVEL,
     Cells,
+    compared,
     encode,
     hold_small,
-    integrate,
 )
 
 REEVALUATION_TOL = 1e-3  # relative: the same formula, evaluated once more
 DIRECTION_TOL = 4 * probe.DIRECTION_EPS  # a direction passes through angles, a transform, and back
 SPOILS = "one such number spoils a picture"
 LENGTH_TOL = 1e-4  # relative: a square root, and the difference of two points
-ENDS = (0, 0.5, 1 - 2.0**-24)  # and the middle
 MAX_UNSAMPLED_LIGHT = 5e-5  # share of the light: a fifth of a cone of 3 degrees
 
 
@@ -90,9 +89,7 @@ class EmitterCase(Case):
             nodes = '"shape": emitter'
             scene = mi.load_dict({"type": "scene", "shape": self.plugin})
             self.plugin = self.plugin.emitter()
-        if not isinstance(self.plugin, mi.Emitter):
-            kind = type(self.plugin).__name__
-            raise UsageError(f"{kind} is not an emitter of {mi.variant()}: give a dict or a loaded emitter")
+        self.need("an emitter", isinstance(self.plugin, mi.Emitter))
         if scene is None and self._has(mi.EmitterFlags.Surface):
             fix = "give the scene that it belongs to, or a dict of its shape"
             raise UsageError(f"the {self.name} cannot light a scene of its own: {fix}")
@@ -134,10 +131,7 @@ class EmitterCase(Case):
             ds, weight = sample(it, u)
             return [ds.p, ds.d, ds.dist, ds.pdf, density(it, ds), ds.delta, weight, light(it, ds)]
 
-        u = self.uniform(len(points), 2)
-        if extreme:
-            ends = self.rng.choice(np.array(ENDS, np.float32), u.shape)
-            u = np.where(self.rng.random(u.shape) < extreme, ends, u)
+        u = self.numbers(len(points), 2, extreme=extreme)
         try:
             columns = lanes(call, ("Point3f", points), ("Point2f", u))
         except (NotImplementedError, RuntimeError) as error:
@@ -180,6 +174,18 @@ class EmitterCase(Case):
     def surface(self) -> mi.Scene:
         """A scene with the emitter's shape alone."""
         return alone(self.plugin.get_shape())
+
+    @cached_property
+    def view(self) -> View:
+        """The view of that shape from all around."""
+        return View(probe.corners(self.surface))
+
+    @cached_property
+    def glimpses(self) -> tuple[Array, Array]:
+        """Whether uniform rays from all around meet it [N], and eval() there [N, channels]."""
+        o = self.view.around(self, self.count(2**17, 2**19))
+        met, _, value, _ = self.met(o, self.view.into_cone(o, self.rng))
+        return met, value
 
     def from_first(self) -> mi.SurfaceInteraction3f:
         """The first of the points."""
@@ -280,8 +286,15 @@ def sampling(law: Outcome, case: EmitterCase) -> None:
     scale = abs(s.dist) + abs(points).max(axis=1)
     off = norm(s.p - points - s.dist[:, None] * s.d, axis=1)
     law.check("place", np.nan_to_num(off / scale), s, where=s.lit, placed=case.placed)
-    if case.lamp:
-        law.check("light", _by_samples_and_by_rays(case))
+    if case.lamp:  # as much by samples as by rays
+        o = case.view.around(case, case.count(2**15, 2**17))
+        seen = case.sample(o)
+        met, t, _, _ = case.met(o, seen.d)
+        visible = met & (t > seen.dist * (1 - 1e-3))
+        by_samples = np.where(visible & seen.lit, probe.finite_or_0(seen.weight).sum(axis=1), 0)
+        met, value = case.glimpses
+        by_rays = np.where(met, probe.finite_or_0(value).sum(axis=1) * CONE, 0)
+        law.check("light", difference(by_samples, by_rays))
     if not case.around:
         return
     rng = np.random.default_rng((case.seed, 2))
@@ -289,20 +302,6 @@ def sampling(law: Outcome, case: EmitterCase) -> None:
     pdf, value = case.seen(anywhere)
     law.check("dark", probe.without_density(value, pdf))
     _in_small_cells(law, case)
-
-
-def _by_samples_and_by_rays(case: EmitterCase) -> float:
-    """Relative difference of irradiance around an emitter, by its samples and by uniform rays."""
-    view = View(probe.corners(case.surface))
-    o = view.around(case, case.count(2**15, 2**17))
-    s = case.sample(o)
-    met, t, _, _ = case.met(o, s.d)
-    visible = met & (t > s.dist * (1 - 1e-3))
-    by_samples = np.where(visible & s.lit, probe.finite_or_0(s.weight).sum(axis=1), 0)
-    o = view.around(case, case.count(2**17, 2**19))
-    met, _, value, _ = case.met(o, view.into_cone(o, case.rng))
-    by_rays = np.where(met, probe.finite_or_0(value).sum(axis=1) * CONE, 0)
-    return difference(by_samples, by_rays)
 
 
 def _in_small_cells(law: Outcome, case: EmitterCase) -> None:
@@ -315,14 +314,9 @@ def _in_small_cells(law: Outcome, case: EmitterCase) -> None:
         s = case.sample(np.broadcast_to(case.points[0], (wave, 3)))
         refused = ~s.lit & (s.value > 0).any(axis=1)
         codes.append(encode(s.d[~refused]))
-    every = np.concatenate(codes)
-    fine = integrate(case.density, cells, np.random.default_rng((case.seed, 3)), every, count)
-    parent = cells.find(fine.start)
-    mean = np.bincount(parent, fine.mean)
-    variance = np.bincount(parent, fine.variance)
-    hold_small(
-        law, cells, np.array([cells.counts(every), count * mean, count**2 * variance]), REEVALUATION_TOL
-    )
+    rng = np.random.default_rng((case.seed, 3))
+    counts = compared(cells, case.density, np.concatenate(codes), count, rng)
+    hold_small(law, cells, counts, REEVALUATION_TOL)
 
 
 @finds("weight", "weight of a sample too large", 3e-3, weight=larger)
@@ -377,9 +371,7 @@ def finite(law: Outcome, case: EmitterCase) -> None:
 def _seen_anywhere(case: EmitterCase) -> Array:
     """eval() where uniform rays hit the emitter, or in directions all around, [N, channels]."""
     if case.lamp:
-        view = View(probe.corners(case.surface))
-        o = view.around(case, case.count(2**16, 2**18))
-        met, _, value, _ = case.met(o, view.into_cone(o, case.rng))
+        met, value = case.glimpses
         return value[met]
     if case.around:
         return case.seen(case.units(case.count(2**16, 2**18)))[1]

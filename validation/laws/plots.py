@@ -38,23 +38,23 @@ def density(cells: Cells, seen: Array, angle: float, figure: Figure) -> None:
     ``angle`` of incidence in degrees. Cells are summed up to those of the coarsest level.
     """
     side = 2 ** int(cells.level.min())
-    r, turn = cells.corner
-    place = np.stack([cells.below, r * side, turn * side]).astype(int)  # [3, C]
-    shares = np.zeros((2, 2, side, side))
-    np.add.at(shares[0], tuple(place), seen)
-    np.add.at(shares[1], tuple(place), cells.mean)
     edges = np.linspace(0, 1, side + 1)
-    shares /= 2 * np.pi / side * np.diff(edges**2)[:, None]
+    areas = 2 * np.pi / side * np.diff(edges**2)[:, None]
     azimuth = 2 * np.pi * edges - np.pi
+    r, turn = cells.corner
     axes = figure.subplots(2, 3, subplot_kw={"projection": "polar"})
-    drawn = {"samples": shares[0], "pdf()": shares[1], "samples − pdf()": shares[0] - shares[1]}
-    for column, (name, values) in zip(axes.T, drawn.items(), strict=True):
-        top = abs(values).max()
-        for each, half, part in zip(column, ("above", "below"), values, strict=True):
-            mesh = each.pcolormesh(azimuth, edges, part, cmap="RdBu_r", vmin=-top, vmax=top)
-            each.set_title(f"{name}, wo {half}", fontsize="small")
+    for row, half, where in zip(axes, (~cells.below, cells.below), ("above", "below"), strict=True):
+        samples, pdf = [
+            np.histogram2d(r[half], turn[half], edges, weights=shares[half])[0] / areas
+            for shares in (seen, cells.mean)
+        ]
+        drawn = {"samples": samples, "pdf()": pdf, "samples − pdf()": samples - pdf}
+        for each, (name, values) in zip(row, drawn.items(), strict=True):
+            top = abs(values).max()
+            mesh = each.pcolormesh(azimuth, edges, values, cmap="RdBu_r", vmin=-top, vmax=top)
+            each.set_title(f"{name}, wo {where}", fontsize="small")
             each.set_axis_off()
-        figure.colorbar(mesh, ax=list(column), orientation="horizontal", label="per steradian")
+            figure.colorbar(mesh, ax=each, orientation="horizontal", label="per steradian")
     figure.suptitle(f"wi at {angle:.0f}° to the normal")
 
 

@@ -158,14 +158,7 @@ class Probe:
 
     def both(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> list[Array]:
         """``eval`` and ``pdf``, each by itself."""
-
-        value = method(self.plugin, "eval")
-        density = method(self.plugin, "pdf")
-
-        def values(*given: object) -> list[mi.Spectrum]:
-            return [value(*given), density(*given)]
-
-        return self.ask(values, at, ctx)
+        return [self.eval(at, ctx), self.pdf(at, ctx)]
 
     def pair(self, at: Lanes, ctx: mi.BSDFContext | None = None) -> list[Array]:
         """The two of ``eval_pdf``."""

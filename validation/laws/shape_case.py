@@ -117,9 +117,8 @@ class ShapeCase(Case):
 
     def __init__(self, given: Given, quick: bool, seed: int) -> None:
         super().__init__(given, quick, seed)
-        if not all(hasattr(self.plugin, name) for name in ("ray_intersect", "ray_test", "bbox")):
-            kind = type(self.plugin).__name__
-            raise UsageError(f"{kind} is not a shape of {mi.variant()}: give a dict or a loaded shape")
+        fits = [hasattr(self.plugin, name) for name in ("ray_intersect", "ray_test", "bbox")]
+        self.need("a shape", all(fits))
         self.target = self.plugin
         if class_name(self.plugin) == "Instance":
             raise UsageError("an instance has no surface of its own: check the shapes of its group")
@@ -128,14 +127,10 @@ class ShapeCase(Case):
         self.box = corners(self.plugin)
         if not np.isfinite(self.box).all() or (self.box[1] < self.box[0]).any():
             raise UsageError(f"the bounding box of the shape is {self.box}: it must be finite")
-        self.points = self.box  # and of a mesh the vertices and the middles of edges
+        self.points = self.box  # and of a mesh the vertices
         params = mi.traverse(self.plugin) if isinstance(self.plugin, mi.Mesh) else {}
-        if "faces" in params:  # a rectangle hides that it is a mesh
-            vertex = np.array(params["vertex_positions"]).reshape(-1, 3)
-            face = np.array(params["faces"]).reshape(-1, 3)
-            ends = vertex[face]  # [F, 3, 3]
-            middles = (ends + np.roll(ends, 1, axis=1)) / 2
-            self.points = np.concatenate([self.box, vertex, middles.reshape(-1, 3)])
+        if "vertex_positions" in params:  # a rectangle hides that it is a mesh
+            self.points = np.concatenate([self.box, np.array(params["vertex_positions"]).reshape(-1, 3)])
         self.low = self.points.min(axis=0)  # the box itself may be wrong
         self.high = self.points.max(axis=0)
         self.view = View(np.array([self.low, self.high]))

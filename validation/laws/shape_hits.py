@@ -553,24 +553,17 @@ def _not_finite(columns: Sequence[Array]) -> Array:
 
 def _extreme_rays(case: ShapeCase) -> Lanes:
     """Hits of rays from and towards extreme places, and along axes."""
-    met = case.met
     rng = case.rng
     count = case.count(2**12, 2**15)
     corners = np.where(rng.random((count, 3)) < 0.5, case.low, case.high)
     middles = np.broadcast_to(case.middle, (count, 3))
-    on_surface = rng.choice(met.p, count)
-    distances = case.size * 10.0 ** rng.uniform(0, 5, (count, 1))
-    afar = case.middle + distances * case.units(count)
-    vertices = rng.choice(case.points, count)
-    kinds = (corners, middles, on_surface, afar, vertices)
+    afar = case.middle + case.size * 10.0 ** rng.uniform(0, 5, (count, 1)) * case.units(count)
+    kinds = (corners, middles, afar, rng.choice(case.met.p, count), rng.choice(case.points, count))
     o = np.choose(rng.integers(len(kinds), size=count)[:, None], kinds).astype(np.float32)
-    d = case.units(count)
-    d[rng.random(d.shape) < 0.4] = 0
-    d = unit(d + np.where((d == 0).all(axis=1, keepdims=True), [0, 0, 1], 0))
-    d[(d == 0) & (rng.random(d.shape) < 0.3)] = 1e-30
+    d = case.units(count) * rng.choice([0, 1e-30, 1], (count, 3), p=[0.3, 0.1, 0.6])
     to_middle = case.middle - o
-    towards = unit(np.where(to_middle == 0, 1, to_middle))
-    d = np.where(rng.random((count, 1)) < 0.3, towards, d)
+    d = np.where(rng.random((count, 1)) < 0.3, to_middle, d)
+    d = unit(np.where((d == 0).all(axis=1, keepdims=True), [0, 0, 1], d))
     return trace(case.target, o, d)
 
 

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.linalg import norm
+from scipy import stats
 from scipy.linalg import null_space
 
 from .faults import larger, member, off_surface, put, smaller, tilted
@@ -221,51 +222,28 @@ def _area(law: Outcome, case: ShapeCase, s: Lanes, area: float) -> None:
     law.check("crossings", beyond / area, limit=room)
     # crossings of a line come together
     size = 1 / (1 / len(s.p) + (crossed**2).sum() / crossed.sum() / len(crossings))
-    apart = []
-    for axis in case.units(AXES):
-        apart += _apart(s.p - case.middle, crossings - case.middle, axis)
-    law.check("spread", _chance(apart, size))
+    both = s.p - case.middle, crossings - case.middle
+    law.check("spread", _chance([(*both, axis) for axis in case.units(AXES)], size))
 
 
-AXES = 12  # aslant, along which positions are compared
+AXES = 8  # aslant, along which positions are compared
 GRAZING_ALLOWANCE = 2e-3  # lines that graze are left room for
 VIEWS = 3  # from which directions are compared
 
 
-def _apart(v: Array, w: Array, axis: Array, weight: Array | None = None) -> list[float]:
-    """Distances of the distributions of vectors [N, 3] and [M, 3] along an axis and in azimuth around it."""
-    across = null_space(axis[None])
-    return [
-        _distance(v @ axis, w @ axis, weight),
-        _distance(np.arctan2(*(v @ across).T), np.arctan2(*(w @ across).T), weight),
-    ]
+def _chance(pairs: Sequence[tuple[Array, Array, Array]], size: float) -> float:
+    """The chance that pairs of sets of vectors are so different along an axis and around it.
 
-
-def _distance(x: Array, y: Array, weight: Array | None = None) -> float:
-    """Kuiper's distance between the distribution of x [N], with weights [N], and that of y [M].
-
-    The largest distance upwards plus the largest downwards: of azimuths the same wherever they start.
+    [N, 3], [M, 3] and [3] each. By Kolmogorov and Smirnov's test, for samples of an effective ``size``.
     """
-    if weight is None:
-        weight = np.ones(len(x))
-    order = np.argsort(x)
-    below = np.concatenate([[0], np.cumsum(weight[order])]) / weight.sum()
-    y = np.sort(y)
-    apart = below[np.searchsorted(x[order], y, side="right")] - np.arange(1, len(y) + 1) / len(y)
-    return float(max(apart.max(), 0) - min(apart.min(), 0))
-
-
-def _chance(apart: Sequence[float], size: float) -> float:
-    """The chance of such distances between samples of such a size (Kuiper's test, Šidák's correction).
-
-    N. H. Kuiper, Tests concerning random points on a circle, Indagationes Mathematicae 63, 1960.
-    """
-    square = size * max(max(apart) - GRAZING_ALLOWANCE, 0) ** 2
-    if square < 0.5:  # the series is near 1, and converges slowly
-        return 1.0
-    terms = square * np.arange(1, 20) ** 2
-    chance = 2 * ((4 * terms - 1) * np.exp(-2 * terms)).sum()
-    return sidak(chance, len(apart))
+    apart = []
+    for v, w, axis in pairs:
+        across = null_space(axis[None])
+        apart.append(stats.ks_2samp(v @ axis, w @ axis, method="asymp").statistic)
+        azimuths = [np.arctan2(*(x @ across).T) for x in (v, w)]
+        apart.append(stats.ks_2samp(*azimuths, method="asymp").statistic)
+    beyond = max(max(apart) - GRAZING_ALLOWANCE, 0)
+    return sidak(stats.kstwobign.sf(np.sqrt(size) * beyond), len(apart))
 
 
 def _directions(law: Outcome, case: ShapeCase) -> None:
@@ -301,9 +279,8 @@ def _aim(law: Outcome, case: ShapeCase) -> None:
     """Directions from some places: their density, and the solid angle of what is visible."""
     count = case.count(2**17, 2**19)
     rng = np.random.default_rng((case.seed, count))
-    apart = []
     angles = []
-    size = np.inf
+    chances = []
     for _ in range(VIEWS):
         place = np.float32(case.middle + 1.5 * case.size * unit(rng.normal(size=3)))
         o = np.tile(place, (count, 1))
@@ -314,12 +291,12 @@ def _aim(law: Outcome, case: ShapeCase) -> None:
         away = case.view.into_cone(o, rng)
         within = trace(case.target, o, away).met
         angles.append(difference(weight, CONE * within))
-        fewest = count // 16
-        if np.count_nonzero(within) < fewest or np.count_nonzero(weight) < fewest:  # seen edge on
-            continue
-        effective = weight.sum() ** 2 / (weight**2).sum()
-        size = min(size, 1 / (1 / effective + 1 / np.count_nonzero(within)))
-        apart += _apart(d, away[within], unit(case.middle - place), weight)
+        # of the directions to what is visible, as many as if they were uniform
+        even = d[rng.random(count) * weight.max() < weight]
+        uniform = away[within]
+        if min(len(even), len(uniform)) > count // 32:  # else it is seen edge on
+            size = 1 / (1 / len(even) + 1 / len(uniform))
+            chances.append(_chance([(even, uniform, unit(case.middle - place))], size))
     law.check("angle", angles)
-    if apart:
-        law.check("aim", _chance(apart, size))
+    if chances:
+        law.check("aim", sidak(min(chances), len(chances)))

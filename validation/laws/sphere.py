@@ -143,11 +143,6 @@ class Cells(Lanes):
         values = function(wo.reshape(-1, 3)).reshape(omega.shape) * omega * POINTS_PER_CELL
         return values.mean(axis=1), values.var(axis=1) / (POINTS_PER_CELL - 1)
 
-    def expected(self, density: Function, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Expected number of ``count`` samples in each cell, and its variance. [C], [C]"""
-        share, variance = self.integrals(density, rng)
-        return count * share, count**2 * variance
-
     def rows(self) -> Iterator[Array]:
         """For each cell [C] the number of its row: of one r or azimuth, or in slices along x and y."""
         r, turn = self.corner
@@ -219,6 +214,18 @@ def integrate(
             break
         cells = cells[bad].quartered()
     return in_order(done)
+
+
+def compared(cells: Cells, density: Function, codes: Array, count: int, rng: np.random.Generator) -> Array:
+    """Samples that are seen in each cell, those expected of ``count``, and the variance of the latter. [3, C]
+
+    ``codes`` are those of the samples seen.
+    """
+    fine = integrate(density, cells, rng, codes, count)
+    cell = cells.find(fine.start)
+    mean = np.bincount(cell, fine.mean)
+    variance = np.bincount(cell, fine.variance)
+    return np.array([cells.counts(codes), count * mean, count**2 * variance])
 
 
 def chi_square(
