@@ -13,6 +13,7 @@ from PIL import Image
 
 from mrt_mitsuba.files import to_8bit
 from mrt_mitsuba.rendering.progress import Progress
+from mrt_mitsuba.validation.laws import bsdf, emitter, shape
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,3 +109,34 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Markdown:
             ]
         )
     )
+
+
+#: The laws of plugins, by kind and name
+LAWS = {"BSDF": bsdf.LAWS, "shape": shape.LAWS, "emitter": emitter.LAWS}
+
+
+def laws() -> list[dict[str, str]]:
+    """A row for each law, which its docstring states, in Markdown."""
+    rows = []
+    for kind, by_name in LAWS.items():
+        for law in by_name.values():
+            words = law.states.replace("``", "`").replace("|", "\\|")
+            rows.append(
+                {"plugin": kind, "law": f"`{law.name}`", "states": words}
+            )
+    return rows
+
+
+def faults() -> list[dict[str, str]]:
+    """A row for each fault, with the least sizes that its law finds."""
+    rows = []
+    for kind, by_name in LAWS.items():
+        for fault in (x for law in by_name.values() for x in law.faults):
+            what = {"plugin": kind, "law": f"`{fault.law}`"}
+            sizes = {"quick": fault.quick, "full": fault.full}
+            sizes = {
+                name: f"{size:.1g}".replace("inf", "not found")
+                for name, size in sizes.items()
+            }
+            rows.append({**what, "fault": fault.what, **sizes})
+    return rows

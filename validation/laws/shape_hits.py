@@ -419,10 +419,11 @@ def _inside(case: ShapeCase) -> Array:
 MOVED = """print("as it is, t:", scene.ray_intersect(mi.Ray3f(o, d)).t)
 scene = mi.load_dict({{"type": "scene", "shape": load(to_world=mi.ScalarTransform4f({matrix}))}})
 si = scene.ray_intersect(mi.Ray3f(mi.Point3f({start}), mi.Vector3f({way})))
-print("turned, moved and 2^{power} times as large, and the ray with it, t:", si.t / 2.0**{power})
+print("{how}, and the ray with it, t over the scale:", si.t / {factor})
 """
 TURN = np.array([[0.8, -0.6, 0], [0.48, 0.64, -0.6], [0.36, 0.48, 0.8]])  # in steps of 37° about two axes
 OFFSET = np.array([0.5, -1, 2])  # in sizes
+POWERS = (-20, -10, 10, 20)  # of two, which round nothing
 
 
 def _alike(law: Outcome, seen: Lanes, there: Lanes) -> None:
@@ -435,38 +436,40 @@ def _alike(law: Outcome, seen: Lanes, there: Lanes) -> None:
 
 @measures(
     answer=share_of(
-        "share of rays answered otherwise at 2^{power} of the size, turned and moved",
+        "share of rays answered otherwise where the shape and they are {how}",
         2e-3,
         "to_world applies to all of it; outlines hang on roundings",
         MOVED,
     ),
     off=most(
-        "distance or normal at 2^{power} of the size, turned and moved, in roundings of the largest number",
+        "distance or normal where the shape and rays are {how}, off by roundings of the largest number",
         4 * MAX_HIT_ROUNDINGS,
         "some dozen operations each, and another cosine with the surface",
         MOVED,
     ),
 )
 def scale(law: Outcome, case: ShapeCase) -> None:
-    """At a millionth and a million times the size, turned and moved, hits are the same."""
+    """At a millionth and a million times the size, and turned and moved, hits are the same."""
     matrix = getattr(case.with_().get("to_world"), "values", np.eye(4))
     if class_name(case.plugin) in UNSCALED:
         raise Skip("to_world does not scale all of it (of curves, the radius stays)")
     seen = case.few(case.seen, 2**12, 2**14)
-    way = unit(seen.d @ TURN.T)
-    for power in (-20, -10, 10, 20):
-        place = np.eye(4)
-        place[:3, :3] = 2.0**power * TURN
-        place[:3, 3] = 2.0**power * case.size * OFFSET
+    places = {f"2^{power} times as large": np.diag([2.0**power] * 3 + [1]) for power in POWERS}
+    places["turned and moved"] = np.eye(4)
+    places["turned and moved"][:3] = np.column_stack([TURN, case.size * OFFSET])
+    for how, place in places.items():
+        factor = float(norm(place[:3, 0]))
+        turn = place[:3, :3] / factor
         to_world = place @ matrix
         try:
             scene = case.scene(to_world=mi.ScalarTransform4f(to_world))
         except RuntimeError as problem:
             raise Skip("to_world is not accepted") from problem
         start = np.float32(seen.o @ place[:3, :3].T + place[:3, 3])
+        way = unit(seen.d @ turn.T)
         there = trace(scene, start, way)
-        there = there.having(t=there.t / 2.0**power, o=there.o / 2.0**power, n=there.n @ TURN)
-        names = {"power": power, "matrix": to_world.tolist(), "start": start, "way": way}
+        there = there.having(t=there.t / factor, o=there.o / factor, n=there.n @ turn)
+        names = {"how": how, "factor": factor, "matrix": to_world.tolist(), "start": start, "way": way}
         _alike(law, Lanes(**vars(seen), **names), there)
 
 

@@ -20,6 +20,7 @@ SIDE = 6
 POINTS_PER_CELL = SIDE**2  # at which a cell is integrated
 HEMISPHERE = 4**MAX_LEVEL  # codes of each
 SMALL_CELL_LEVEL = 7  # level of cells of about a degree
+MAX_DOUBTFUL = 256  # cells that are cut because samples contradict them: if more do, the density is wrong
 MAX_REFINEMENTS = 8  # at integrals that are certain enough
 # bits with gaps
 _SPREAD = np.sum(
@@ -208,6 +209,10 @@ def integrate(
         enough = 0.25 * mean / total / samples + 1 / samples**2
         bad = variance / total**2 > enough
         bad |= (seen > 1) & (mean < 0.2 * seen / samples)
+        # a corner of a bright texel may lie between the points of a cell
+        doubtful = (seen - samples * mean) ** 2 > 16 * (samples * mean + samples**2 * variance + 1)
+        if doubtful.sum() < MAX_DOUBTFUL:
+            bad |= doubtful
         bad &= (cells.level < MAX_LEVEL) & (attempt < MAX_REFINEMENTS - 1)
         done.append(cells.having(mean=mean, variance=variance)[~bad])
         if not bad.any():
