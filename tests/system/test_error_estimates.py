@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.machine import Workspace
 from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.validation.scenery import load_kind
 
@@ -90,20 +89,6 @@ def test_intervals_reach_farther_up_the_fewer_squares_there_are():
     assert ratios[0] > 1.5
     assert ratios[0] > ratios[1] > ratios[2]
     assert ratios[2] == pytest.approx(1, abs=0.05)
-
-
-@pytest.mark.filterwarnings("ignore:a few rays dominate the error")
-def test_the_brightest_ray_of_a_pixel_is_known_however_wavefronts_are_cut(monkeypatch):
-    """Of pixels whose rays are traced by twenty at a time: the tail is that of one wavefront, but for sums in
-    another order."""
-    options = {"integrator": noise(rare=0.005), "aamode": "noise", "spp": 128, "seed": 1}
-    scene = camera(6, 4)
-    whole = mrt.render(scene, **options)
-    monkeypatch.setattr(Workspace, "wavefront_size", lambda self, channels: 20)
-    parts = mrt.render(scene, **options)
-    assert parts.kernel_launches > 2 * whole.kernel_launches
-    assert whole.error.tail > 0.3
-    assert parts.error.tail == pytest.approx(whole.error.tail, rel=1e-3)
 
 
 def test_pixels_that_take_rays_take_all_that_the_filter_reaches_from():

@@ -190,21 +190,6 @@ def test_stated_errors_hold_and_means_are_unbiased(ball, radius, seeds, unreliab
     assert stats.kstest(p_values, "uniform").pvalue > 1e-3
 
 
-def test_stated_errors_of_pixels_are_true_in_every_tenth():
-    box = mi.cornell_box()
-    box["sensor"]["film"] |= {"width": 24, "height": 24}
-    scene = mi.load_dict(box)
-    path = mi.load_dict({"type": "path"})
-    truth, noise = averaged([mi.render(scene, integrator=path, spp=64, seed=1000 + k) for k in range(8)])
-    options = {"integrator": "path", "aamode": "noise", "spp": 32}
-    results = [mrt.render(scene, seed=seed, **options) for seed in range(3)]
-    stated = np.square([result.layers["error.Y"] for result in results])
-    true = np.square([result.image for result in results] - truth).mean(axis=-1) - noise
-    tenths = np.array_split(np.argsort(stated, axis=None), 10)
-    ratios = np.sqrt([true.ravel()[part].mean() / stated.ravel()[part].mean() for part in tenths[2:]])
-    assert ratios.min() > 1 / 3 and ratios.max() < 3  # the darkest pixels see no noise to speak of
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:a few rays dominate the error")
 def test_errors_end_at_their_target_against_the_best_sampler(monkeypatch):
@@ -379,12 +364,3 @@ def test_a_target_is_hit_and_not_only_passed(kind, rfilter, size):
     true = np.array([error(result.image) for result in results]) / target
     assert 0.88 < np.median(true) < 1
     assert np.sqrt(np.mean(stated**2)) < 1
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:a few rays dominate the error")
-def test_the_estimated_error_ends_at_its_target():
-    """Also where the first round that halves decide leaves some pictures above it, as with glass."""
-    scene = load_kind("glass", 48)
-    for seed in range(24):
-        assert mrt.render(scene, target=0.005, seed=seed).error.rmse <= 0.005

@@ -72,24 +72,6 @@ def test_listings(capsys):
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list("0123456789")
 
 
-def test_what_is_printed_cannot_control_a_terminal(tmp_path, capsys):
-    """Names of a TOML file and of an XML file, and a path."""
-    (tmp_path / "a.toml").write_text('repeats = 1\n[reference]\naa = 1\n[cases."a\\u009b31m"]\naa = 1\n')
-    (tmp_path / "a.xml").write_text(
-        "<scene version='3.0.0'><integrator type='direct'/><sensor type='perspective'><film type='hdrfilm'>"
-        "<integer name='width' value='8'/><integer name='height' value='8'/></film></sensor>"
-        "<shape type='sphere' id='a&#x9b;31m'><bsdf type='diffuse' id='b&#x9b;32m'/></shape></scene>"
-    )
-    xml = str(tmp_path / "a.xml")
-    for words in (["check", xml, "quick=1"], ["export", xml, "--xml", str(tmp_path / "o\x9b3.xml")]):
-        assert cli.main(words) in (0, 1)
-        text, errors = capsys.readouterr()
-        assert "\\x9b3" in text
-        assert (text + errors).replace("\n", "").isprintable()
-    cli.main(["error-vs-time", xml, f"cases={tmp_path / 'a.toml'}", f"out={tmp_path / 'out'}"])
-    assert "\x9b" not in "".join(capsys.readouterr())
-
-
 failures = Cases()
 failures(SceneError("no such file: a.xml"), 0, 1, "no such file: a.xml\n")
 failures(KeyboardInterrupt(), 0, 130, "interrupted\n")

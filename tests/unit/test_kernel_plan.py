@@ -25,6 +25,7 @@ SMOOTH = mesh(CORNERS, [(0, 1, 2)], normals=[(-0.6, 0, 0.8), (0.6, 0, 0.8), (0, 
 SPHERE: dict[str, Any] = {"type": "sphere", "radius": 0.7, "bsdf": {"type": "mrt_bsdf"}}
 CONE = {"type": "mrt_cone", "apex": [0, 1, 1], "base_center": [0, 0, 1], "radius": 0.4}
 LIGHT = {"type": "mrt_light", "position": [2, 4, 3]}
+LIGHTS = {f"light{k}": {**LIGHT, "position": [2, k - 4, 3], "intensity": 0.1 * k} for k in range(9)}
 LAMP = {"type": "sphere", "center": [0, 3, 0], "radius": 0.2, "emitter": {"type": "area"}}
 BRUSHED = {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4}
 CROWD = {
@@ -80,7 +81,7 @@ choice("coherent", False, same=True, a=MESH, light=LIGHT)
 choice("spheres", "corrected", same=True, a=SPHERE, light=LIGHT)
 choice("quadrics", (), a=CONE, b=SPHERE, light=LIGHT)
 choice("planes", False, a=PLANE, b=SPHERE, light=LIGHT)
-choice("lights", "loop", same=True, a=SPHERE, light=LIGHT)
+choice("lights", "loop", same=True, a=SPHERE, **LIGHTS)  # of a table
 choice("light_buffers", False, same=True, **CROWD, light=LIGHT)
 choice("eye_buffer", False, same=True, a=GROUP, light=LIGHT)
 choice("sky", "none", a=SPHERE, sky=SKY, light=LIGHT)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -74,25 +74,6 @@ def test_light_tracing_is_refused_where_there_is_one():
     assert mi.render(mi.load_dict(box), integrator=tracer, spp=4).numpy().mean() > 0
     with pytest.raises(NotImplementedError, match="light tracing needs a finite emitted power"):
         tracer.render(mi.load_dict(box | {"other": other}), spp=4)
-
-
-def test_lights_of_the_table_are_those_of_calls():
-    """With some on each of the six sides of a ball."""
-    nodes: dict[str, Any] = {"type": "scene"}
-    nodes["integrator"] = {"type": "mrt_whitted", "max_depth": 1, "min_contribution": 0.0}
-    nodes["sensor"] = sensor([3, 4, 2], [0, 0, 0], (32, 24))
-    nodes["ball"] = {"type": "sphere", "bsdf": {"type": "mrt_bsdf"}}
-    for k, side in enumerate(np.repeat([*np.eye(3), *-np.eye(3)], 3, axis=0)):
-        color = {"type": "rgb", "value": [0.1, 0.02 * k, 0.2]}
-        nodes[f"light{k}"] = {"type": "mrt_light", "position": (3 * side).tolist(), "intensity": color}
-    scene = mi.load_dict(nodes)
-    image = np.array(mi.render(scene, spp=1))
-    integrator = scene.integrator()
-    plan = integrator.prepare(scene).plan
-    assert plan.lights == "table"
-    assert image.std() > 1e-3
-    integrator.kernel_plan = lambda facts: replace(plan, lights="loop")
-    assert_allclose(image, np.array(mi.render(scene, spp=1)), atol=1e-6)
 
 
 def upright(kind: str) -> Callable[[float], dict[str, Any]]:
