@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from dataclasses import dataclass
 from pathlib import Path
 
 from mrt_mitsuba.errors import UsageError
@@ -37,58 +36,47 @@ def budget(wanted: int | None) -> int:
     return min(free // 2 if wanted is None else wanted, most)
 
 
-@dataclass(frozen=True)
-class Workspace:
-    """Memory for the rays and the filters at work, without that of the picture: ``size`` bytes."""
+def workspace(
+    budget: int, width: int, height: int, channels: int, *, pictures: int = 1, rays_per_pixel: int = 1
+) -> int:
+    """Return the bytes for rays and filters that a budget leaves next to pictures of float32 channels.
 
-    size: int
-
-    @classmethod
-    def from_budget(
-        cls,
-        width: int,
-        height: int,
-        channels: int,
-        *,
-        budget: int,
-        pictures: int = 1,
-        rays_per_pixel: int = 1,
-    ) -> Workspace:
-        """Return what a budget (bytes) leaves next to ``pictures`` pictures of ``channels`` float32 channels.
-
-        ``rays_per_pixel``: traced at once. Raises ``UsageError`` if the budget does not suffice.
-        """
-        pixels = width * height
-        finished = pixels * (pictures * channels * BYTES_PER_CHANNEL + BYTES_TO_WRITE) + BYTES_OF_KERNELS
-        least = max(
-            max(min(MIN_WAVEFRONT, pixels), rays_per_pixel) * channels * BYTES_PER_CHANNEL_OF_RAY,
-            min(MIN_BAND_ROWS, height) * width * BYTES_PER_PIXEL_OF_FILTER,
+    ``rays_per_pixel``: traced at once. Raises ``UsageError`` if the budget does not suffice.
+    """
+    pixels = width * height
+    finished = pixels * (pictures * channels * BYTES_PER_CHANNEL + BYTES_TO_WRITE) + BYTES_OF_KERNELS
+    least = max(
+        max(min(MIN_WAVEFRONT, pixels), rays_per_pixel) * channels * BYTES_PER_CHANNEL_OF_RAY,
+        min(MIN_BAND_ROWS, height) * width * BYTES_PER_PIXEL_OF_FILTER,
+    )
+    if finished + least > budget:
+        raise UsageError(
+            f"a picture of {width}x{height} pixels needs {_text(finished + least)} of memory, "
+            f"and {_text(budget)} may be used: choose a smaller width and height, "
+            f"fewer layers or samples, or a larger memory="
         )
-        if finished + least > budget:
-            raise UsageError(
-                f"a picture of {width}x{height} pixels needs {_text(finished + least)} of memory, "
-                f"and {_text(budget)} may be used: choose a smaller width and height, "
-                f"fewer layers or samples, or a larger memory="
-            )
-        return cls(budget - finished)
+    return budget - finished
 
-    def wavefront_size(self, channels: int) -> int:
-        """Return the number of rays of a wavefront that returns ``channels`` values each."""
-        return max(1, min(self.size // (channels * BYTES_PER_CHANNEL_OF_RAY), MAX_WAVEFRONT))
 
-    def band_rows(self, width: int) -> int:
-        """Return the number of rows of a picture that a filter works on at once."""
-        return max(1, min(self.size // BYTES_PER_PIXEL_OF_FILTER, MAX_BAND) // width)
+def wavefront_size(space: int, channels: int) -> int:
+    """Return the number of rays of a wavefront that returns ``channels`` values each."""
+    return max(1, min(space // (channels * BYTES_PER_CHANNEL_OF_RAY), MAX_WAVEFRONT))
 
-    def flush_cache(self, used: int) -> None:
-        """Flush Dr.Jit's allocation cache after a pass that used more than a quarter of the workspace.
 
-        A picture takes up to four passes, which seldom reuse each other's arrays: they differ in size.
-        """
-        import drjit as dr
+def band_rows(space: int, width: int) -> int:
+    """Return the number of rows of a picture that a filter works on at once."""
+    return max(1, min(space // BYTES_PER_PIXEL_OF_FILTER, MAX_BAND) // width)
 
-        if used > self.size // 4:
-            dr.flush_malloc_cache()
+
+def flush_cache(space: int, used: int) -> None:
+    """Flush Dr.Jit's allocation cache after a pass that used more than a quarter of the workspace.
+
+    A picture takes up to four passes, which seldom reuse each other's arrays: they differ in size.
+    """
+    import drjit as dr
+
+    if used > space // 4:
+        dr.flush_malloc_cache()
 
 
 def memory() -> tuple[int, int]:

@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import UsageError, printable
+from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.files import images
 from mrt_mitsuba.files.layers import AVERAGED
 from mrt_mitsuba.files.layers import TABLE as LAYER_TABLE
 from mrt_mitsuba.interrupts import defer_signals
-from mrt_mitsuba.machine import Workspace, budget
+from mrt_mitsuba.machine import budget, workspace
 from mrt_mitsuba.options import Values
 from mrt_mitsuba.rendering.exposing import FILM_PREFIX
 from mrt_mitsuba.rendering.passes import Passes
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from mrt_mitsuba.adaptive.target import Target
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """A finished picture, its layers, and how it was made."""
 
@@ -97,13 +97,6 @@ class Result:
             **estimated,
             **{f"mrt:{name}": matrix.tolist() for name, matrix in self.camera.items()},
         }
-
-    def __repr__(self) -> str:
-        height, width = self.image.shape[:2]
-        layers = f", layers {', '.join(self.layers)}" if self.layers else ""
-        error = "" if self.error is None else f", error {self.error}"
-        name = printable(self.plan.scene)
-        return f"<Result of scene {name}: {width}x{height}{layers}{error}, {self.timings.total:.3g} s>"
 
     def _repr_png_(self) -> bytes:
         """Return the picture as a notebook shows it, in sRGB as screens expect it."""
@@ -233,15 +226,15 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
     with sized(source):  # before the shader, whose film has this size
         shader = Shader(source, settings.motion)
         plan = make_plan(source, shader, settings)
-        workspace = Workspace.from_budget(
+        space = workspace(
+            job.budget,
             plan.width,
             plan.height,
             plan.channels,
             pictures=min(plan.frames, 2),  # the frames' sum, and one of them
             rays_per_pixel=max(step.pattern.size for step in plan.passes),
-            budget=job.budget,
         )
-        job.start(plan, workspace)
+        job.start(plan, space)
         picture = _frames(shader, plan, job)
         layers = picture.layers
         error = picture.error

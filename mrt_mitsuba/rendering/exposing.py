@@ -22,7 +22,7 @@ import numpy as np
 from mrt_mitsuba.files.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.filters.grid import dilated
 from mrt_mitsuba.interrupts import deliver_pending
-from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY
+from mrt_mitsuba.machine import BYTES_PER_CHANNEL_OF_RAY, flush_cache, wavefront_size
 from mrt_mitsuba.rendering.canvas import Canvas
 from mrt_mitsuba.rendering.film import Film, SamplePattern, derived_seed, divide, opaque
 from mrt_mitsuba.rendering.plan import Pass
@@ -311,9 +311,9 @@ class Exposer:
                 del sums, means
             del values  # which would take room, as these would, next to the next wavefront
             advance(part.stop - part.start)
-        workspace = self.job.workspace
-        most = max(workspace.wavefront_size(channels), groups.size)
-        workspace.flush_cache(min(most, groups.rays) * channels * BYTES_PER_CHANNEL_OF_RAY)
+        space = self.job.workspace
+        most = max(wavefront_size(space, channels), groups.size)
+        flush_cache(space, min(most, groups.rays) * channels * BYTES_PER_CHANNEL_OF_RAY)
 
     def expose(
         self,
@@ -342,7 +342,7 @@ class Exposer:
         film, and their values.
         """
         width = self.film.width if self.film else self.shader.width
-        most = self.job.workspace.wavefront_size(channels)
+        most = wavefront_size(self.job.workspace, channels)
         self._wavefront = min(most, self._wavefront)
         # the random numbers of Mitsuba's samplers depend on the cuts, which time must not decide
         timed = self.film is None or self.film.independent

@@ -16,7 +16,7 @@ import numpy as np
 from mrt_mitsuba import filters
 from mrt_mitsuba.files.layers import TABLE
 from mrt_mitsuba.filters import dof, edges
-from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER
+from mrt_mitsuba.machine import BYTES_PER_PIXEL_OF_FILTER, band_rows, flush_cache
 from mrt_mitsuba.plugins.signals import left_to_other_threads
 from mrt_mitsuba.rendering.exposing import FILM_PREFIX, Exposer, FilmAccumulator, RayBatch, widened
 from mrt_mitsuba.rendering.film import derived_seed
@@ -237,13 +237,13 @@ class Passes:
         with its halo as for the whole picture.
         """
         height, width = self._edge.shape
-        most = self._job.workspace.band_rows(width)
+        most = band_rows(self._job.workspace, width)
         step = height if height <= most else max(most - 2 * halo, halo, 1)
         for start in range(0, height, step):
             stop = min(start + step, height)
             top = max(start - halo, 0)
             yield slice(start, stop), slice(top, min(stop + halo, height)), slice(start - top, stop - top)
-        self._job.workspace.flush_cache(min(most, height) * width * BYTES_PER_PIXEL_OF_FILTER)
+        flush_cache(self._job.workspace, min(most, height) * width * BYTES_PER_PIXEL_OF_FILTER)
 
     def _layer(self, name: str) -> np.ndarray:
         """Return a layer, of zeros if it is new; all but the picture in planes, as an EXR has them."""

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.interrupts import deliver_pending
-from mrt_mitsuba.machine import Workspace
 
 if TYPE_CHECKING:
     from mrt_mitsuba.adaptive.error import RoundPicture
@@ -103,7 +102,7 @@ class Timings:
 class Job:
     """A render under way: where it reports, how much it does at once, and what it has cost so far."""
 
-    workspace: Workspace  #: memory for rays and filters, known once there is a plan
+    workspace: int  #: bytes for rays and filters, known once there is a plan
 
     def __init__(
         self, progress: Progress, budget: int, on_round: Callable[[RoundPicture], object] | None
@@ -117,7 +116,7 @@ class Job:
         self._began = time.perf_counter()
         self._collected = 0.0  # when Dr.Jit's records were read last
 
-    def start(self, plan: object, workspace: Workspace) -> None:
+    def start(self, plan: object, workspace: int) -> None:
         """Begin with a plan, and with the memory next to its picture."""
         self.workspace = workspace
         self.progress.plan(plan)

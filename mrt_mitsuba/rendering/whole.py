@@ -8,6 +8,7 @@ import numpy as np
 
 from mrt_mitsuba.adaptive.estimate import LUMINANCE
 from mrt_mitsuba.errors import SceneError, UsageError, one_line
+from mrt_mitsuba.machine import wavefront_size
 from mrt_mitsuba.plugins.signals import left_to_other_threads
 from mrt_mitsuba.rendering.exposing import Exposer
 from mrt_mitsuba.rendering.film import derived_seed
@@ -29,7 +30,7 @@ def whole_picture(exposer: Exposer, seed: int, rays: int, advance: Advance) -> t
         )
     total: Any = 0
     traced = 0
-    most = max(1, job.workspace.wavefront_size(len(exposer.names)) // film.pixels)
+    most = max(1, wavefront_size(job.workspace, len(exposer.names)) // film.pixels)
     for done in range(0, rays, most):
         count = film.rays_near(min(most, rays - done))
         try:

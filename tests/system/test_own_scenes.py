@@ -16,7 +16,7 @@ from scipy import stats
 import mrt_mitsuba as mrt
 from mrt_mitsuba.command.main import main
 from mrt_mitsuba.files import read_exr
-from mrt_mitsuba.machine import Workspace
+from mrt_mitsuba.rendering import exposing
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation.compare import averaged
 from mrt_mitsuba.validation.scenery import SPP, load_kind, load_room, sensor
@@ -232,7 +232,7 @@ def test_rays_go_where_the_noise_is():
 def test_wavefronts_do_not_change_a_bit(monkeypatch, name, options):
     scene = _load(name)
     whole = mrt.render(scene, **options)
-    monkeypatch.setattr(Workspace, "wavefront_size", lambda self, channels: 8000)  # more than those of a row
+    monkeypatch.setattr(exposing, "wavefront_size", lambda space, channels: 8000)  # more than those of a row
     parts = mrt.render(scene, **options)
     assert parts.kernel_launches > whole.kernel_launches
     assert np.array_equal(parts.image, whole.image)

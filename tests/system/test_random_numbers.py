@@ -10,7 +10,7 @@ import pytest
 from cases import Cases
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.machine import Workspace
+from mrt_mitsuba.rendering import exposing
 from mrt_mitsuba.rendering.film import derived_seed
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -57,7 +57,7 @@ passes({**REFINED, "spp": 4, "sampler": "multijitter"}, name="film, refined, jit
 def test_no_two_rays_draw_the_same(options, at_once, monkeypatch):
     """Of some thousand rays, with seeds that follow each other, two have the same 48 bits by chance once in a
     million such tests."""
-    monkeypatch.setattr(Workspace, "wavefront_size", lambda self, channels: at_once)
+    monkeypatch.setattr(exposing, "wavefront_size", lambda space, channels: at_once)
     nodes = mrt.scene_dict(0, **SIZE)
     nodes["sensor"]["sampler"] = {"type": options.get("sampler", "independent"), "sample_count": 4}
     scene = mi.load_dict(nodes)
@@ -91,7 +91,7 @@ def test_parts_of_a_whole_picture_draw_numbers_of_their_own(monkeypatch):
     scene = mi.load_dict(box)
     options = {"integrator": "ptracer", "aamode": "none", "seed": 3}
     few = mrt.render(scene, spp=8, **options)
-    monkeypatch.setattr(Workspace, "wavefront_size", lambda self, channels: few.rays["primary"])
+    monkeypatch.setattr(exposing, "wavefront_size", lambda space, channels: few.rays["primary"])
     many = mrt.render(scene, spp=16, **options)
     assert many.rays["primary"] == 2 * few.rays["primary"]
     assert not np.allclose(many.image, few.image, rtol=1e-4)

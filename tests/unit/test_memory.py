@@ -11,7 +11,7 @@ from cases import Cases
 
 from mrt_mitsuba import machine, runtime
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.machine import Workspace, budget, usable_cores
+from mrt_mitsuba.machine import budget, usable_cores, workspace
 
 GIB = 2**30
 
@@ -29,7 +29,7 @@ GIB = 2**30
 )
 def test_a_picture_that_does_not_fit_is_refused_with_both_sizes(more, needed):
     with pytest.raises(UsageError, match=f"16384x16384 pixels needs {needed} of memory, and 4.0 GiB may be"):
-        Workspace.from_budget(16384, 16384, 3, budget=4 * GIB, **more)
+        workspace(4 * GIB, 16384, 16384, 3, **more)
 
 
 def show(group: Path, files: dict[str, str]) -> Path:
