@@ -34,6 +34,11 @@ def one_line(text: str) -> str:
     return printable(" ".join(text.split()))
 
 
+def reason(error: BaseException) -> str:
+    """Return why a system call failed, without number and path; of any other error, its text."""
+    return getattr(error, "strerror", None) or str(error)
+
+
 class MrtError(Exception):
     """Base of all errors raised on purpose; the commands print one line and end with ``exit_code``."""
 
@@ -59,10 +64,6 @@ class OutputError(MrtError):
 
 class VariantError(MrtError):
     """A Mitsuba variant cannot be used here: no LLVM, an LLVM that is too old, no GPU."""
-
-
-class UnknownVariantError(VariantError, UsageError):
-    """A variant name that this Mitsuba was not built with."""
 
 
 class MrtWarning(UserWarning):

@@ -56,12 +56,13 @@ class Patch:
         _, *path, name = self.where.split(".")
         owner = reduce(getattr, path, mi)
         original = getattr(owner, name)
+        replacement = self.replacement
         if getattr(original, "mrt_patch", "") == self.where:  # ours, or another's that wraps ours
             return
 
         @wraps(original)
         def call(*args: object, **given: object) -> object:
-            return self.replacement(original, *args, **given) if _in_effect else original(*args, **given)
+            return replacement(original, *args, **given) if _in_effect else original(*args, **given)
 
         call.mrt_patch = self.where  # type: ignore[attr-defined]
         with contextlib.suppress(ValueError, TypeError):  # functions in C++ have none

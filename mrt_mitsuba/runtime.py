@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mrt_mitsuba import llvm, mitsuba_changes, plugins
-from mrt_mitsuba.errors import UnknownVariantError, VariantError, warn
+from mrt_mitsuba.errors import UsageError, VariantError, warn
 from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.machine import usable_cores
 from mrt_mitsuba.mitsuba_changes import render_lock
@@ -38,7 +38,7 @@ def use(variant: str | None = None) -> str:
     Without a name, the variant that is already set stays; where none is set, it is ``llvm_ad_rgb``, or
     ``scalar_rgb`` with one warning where LLVM cannot be used.
 
-    Raises ``UnknownVariantError`` for a name that this Mitsuba does not know, and ``VariantError`` for one
+    Raises ``UsageError`` for a name that this Mitsuba does not know, and ``VariantError`` for one
     that cannot run here.
     """
     global _used
@@ -52,7 +52,7 @@ def use(variant: str | None = None) -> str:
             close = difflib.get_close_matches(variant, mi.variants(), n=1)
             known = ", ".join(mi.variants())
             hint = f" Did you mean {close[0]}?" if close else ""
-            raise UnknownVariantError(f"unknown variant {variant!r}.{hint} This Mitsuba has {known}.")
+            raise UsageError(f"unknown variant {variant!r}.{hint} This Mitsuba has {known}.")
         if problem := obstacle(variant):
             raise VariantError(f"the variant {variant} cannot be used: {problem}")
         if mi.variant() != variant:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import SimpleNamespace
 from typing import IO, TYPE_CHECKING, Any
 
-from mrt_mitsuba.errors import OutputError, UsageError, warn
+from mrt_mitsuba.errors import OutputError, UsageError, reason, warn
 from mrt_mitsuba.files.replacing import replacing
 from mrt_mitsuba.interrupts import defer_signals, deliver_pending
 from mrt_mitsuba.machine import usable_cores
@@ -71,12 +71,15 @@ def save(
         endings.append(os.path.splitext(os.fspath(path))[1].lower())
         if endings[-1] not in (".png", ".exr"):
             raise OutputError(f"cannot write {os.fspath(path)}: the name must end in .png or .exr")
+    picture = _floats(image, "the picture")
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
+        raise OutputError(f"the picture has shape {picture.shape}; expected [H, W, 3], not empty")
     with replacing(*paths, inputs=inputs) as files:
         for file, ending in zip(files, endings, strict=True):
             if ending == ".png":
-                _write_png(file, image, tonemap)
+                _write_png(file, picture, tonemap)
             else:
-                _write_exr(file, image, layers or {}, header or {}, compression)
+                _write_exr(file, picture, layers or {}, header or {}, compression)
 
 
 def _floats(values: Any, what: str) -> Image:
@@ -92,30 +95,27 @@ def _floats(values: Any, what: str) -> Image:
         raise OutputError(f"{what} is no array of numbers: {error}") from error
 
 
-def _picture(image: Any) -> Image:
-    """Return a picture as float32 [H, W, 3]; raise ``OutputError`` for other shapes."""
-    picture = _floats(image, "the picture")
-    if picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
-        raise OutputError(f"the picture has shape {picture.shape}; expected [H, W, 3], not empty")
-    return picture
-
-
 def _write_png(file: IO[bytes], image: Image, tonemap: str) -> None:
     from PIL import Image as PilImage
 
-    picture = PilImage.fromarray(to_8bit(_picture(image), tonemap))
+    picture = PilImage.fromarray(to_8bit(image, tonemap))
     picture.save(file, format="PNG", compress_type=PNG_RUNS)
 
 
 def _write_exr(
     file: IO[bytes], image: Image, layers: Mapping[str, Image], header: Values, compression: str
 ) -> None:
-    """Write the picture [H, W, 3] and its layers."""
+    """Write the picture [H, W, 3] and its layers, which are copied only where the library would."""
+    import numpy as np
     import OpenEXR
 
-    planes = _planes(image, layers)
-    for name in (*planes, *header):
+    planes = {"RGB": np.ascontiguousarray(image)}
+    for name in (*layers, *header):
         _check_name(name)
+    for name, values in layers.items():
+        planes[name] = np.ascontiguousarray(_floats(values, f"layer {name}"))
+        if planes[name].shape != image.shape[:2]:
+            raise OutputError(f"layer {name} of shape {planes[name].shape} is no channel of the picture")
     attributes = {name: _attribute(name, value) for name, value in header.items()}
     raised: list[BaseException] = []
 
@@ -151,18 +151,6 @@ def _write_exr(
                 raise OutputError(f"not a picture that an EXR can hold: {error}") from error
         if raised:
             raise raised[0]
-
-
-def _planes(image: Image, layers: Mapping[str, Image]) -> dict[str, Image]:
-    """Return the picture as "RGB" and [H, W] for each channel, copied only where the library would."""
-    import numpy as np
-
-    planes = {"RGB": np.ascontiguousarray(_picture(image))}
-    for name, values in layers.items():
-        planes[name] = np.ascontiguousarray(_floats(values, f"layer {name}"))
-        if planes[name].shape != planes["RGB"].shape[:2]:
-            raise OutputError(f"layer {name} of shape {planes[name].shape} is no channel of the picture")
-    return planes
 
 
 def _check_name(name: Any) -> None:
@@ -252,7 +240,7 @@ def read_channels(path: StrPath) -> tuple[dict[str, Image], dict[str, dict[str, 
         if not parts:
             raise ValueError("no part of it can be read")
     except OSError as error:
-        raise OutputError(f"cannot read {name}: {error.strerror or error}") from error
+        raise OutputError(f"cannot read {name}: {reason(error)}") from error
     except (RuntimeError, ValueError, TypeError) as error:
         raise OutputError(f"cannot read {name}: not a whole EXR ({error})") from error
     planes = {}

@@ -12,7 +12,7 @@ import stat
 from collections.abc import Iterable, Iterator
 from typing import IO
 
-from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.errors import OutputError, reason
 from mrt_mitsuba.interrupts import defer_signals
 from mrt_mitsuba.options import StrPath
 
@@ -62,8 +62,7 @@ def _explained(*paths: StrPath) -> Iterator[None]:
         yield
     except (OSError, UnicodeEncodeError) as error:  # a lone surrogate in a name
         names = " and ".join(os.fspath(path) for path in paths)
-        why = getattr(error, "strerror", None) or error
-        raise OutputError(f"cannot write {names}: {why}") from error
+        raise OutputError(f"cannot write {names}: {reason(error)}") from error
 
 
 def _target(path: StrPath, inputs: Iterable[StrPath]) -> str:
@@ -104,8 +103,7 @@ def make_folder(folder: StrPath) -> str:
         path = os.path.abspath(os.fsdecode(folder))
         os.makedirs(path, exist_ok=True)
     except (OSError, TypeError, ValueError) as error:  # also of a zero byte, or a lone surrogate
-        why = getattr(error, "strerror", None) or error
-        raise OutputError(f"cannot make the folder {folder!s}: {why}; choose another") from error
+        raise OutputError(f"cannot make the folder {folder!s}: {reason(error)}; choose another") from error
     return path
 
 

@@ -218,22 +218,21 @@ class Film:
         """
         share = self.weights / self.weights.sum()
         beside = (float((share * self._offsets**2).sum()) - 1 / 12) / 2
-        for axis in (0, 1) if self.reach else ():
-            padded = np.pad(means, [(int(axis == k),) * 2 for k in range(3)], mode="edge")
-            wide = sliding_window_view(padded, 3, axis)
-            means = wide[..., 1] + np.float32(beside) * (wide[..., 0] + wide[..., 2] - 2 * wide[..., 1])
-        return means
+        return self._convolved(means, np.array([beside, 1 - 2 * beside, beside], np.float32), (0, 1))
 
     def filtered_variance(self, variance: np.ndarray) -> np.ndarray:
         """Convolve the variance [..., H, W] of pixel means with the squared filter, up to a factor."""
         share = np.square(self.weights).sum(axis=1)
-        share = np.float32(share / share.sum())
-        for axis in (-2, -1) if self.reach else ():
-            padding = [(0, 0)] * variance.ndim
-            padding[axis] = (self.reach, self.reach)
-            padded = np.pad(variance, padding, mode="edge")
-            wide = sliding_window_view(padded, len(share), axis)
-            variance = share[self.reach] * wide[..., self.reach]
-            for k in range(self.reach):  # the filter is symmetric
-                variance = variance + (wide[..., k] + wide[..., -1 - k]) * share[k]
-        return variance
+        return self._convolved(variance, (share / share.sum()).astype(np.float32), (-2, -1))
+
+    def _convolved(self, values: np.ndarray, taps: np.ndarray, axes: tuple[int, int]) -> np.ndarray:
+        """Convolve with symmetric taps along each axis; beyond the border, values are those of the border."""
+        reach = len(taps) // 2
+        for axis in axes if self.reach else ():
+            padding = [(0, 0)] * values.ndim
+            padding[axis] = (reach, reach)
+            wide = sliding_window_view(np.pad(values, padding, mode="edge"), len(taps), axis)
+            values = taps[reach] * wide[..., reach]
+            for k in range(reach):
+                values = values + (wide[..., k] + wide[..., -1 - k]) * taps[k]
+        return values

@@ -13,6 +13,7 @@ import mitsuba as mi
 from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import UsageError, needs_extra
 from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
+from mrt_mitsuba.options import either
 from mrt_mitsuba.plugins.whitted import plan as kernel_plan
 from mrt_mitsuba.plugins.whitted.plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rendering.film import Film, SamplePattern
@@ -54,12 +55,10 @@ class Pass:
 
     def _counted(self, more: str = "") -> str:
         """Return the number of samples of a pixel in words, such as "15 more samples, 2 rays each"."""
-        if self.pattern.lattice == FILM:
-            return f"{self.pattern.size}{more} samples" if self.pattern.size > 1 else f"1{more} sample"
-        count = self.pattern.count
-        repeats = self.pattern.repeats
-        text = f"{count}{more} sample{'s' if count > 1 else ''}"
-        return f"{text}, {repeats} rays each" if repeats > 1 else text
+        on_lattice = self.pattern.lattice != FILM
+        count = self.pattern.count if on_lattice else self.pattern.size
+        each = f", {self.pattern.repeats} rays each" if on_lattice and self.pattern.repeats > 1 else ""
+        return f"{count}{more} sample{'s' if count > 1 else ''}{each}"
 
     def _placed(self) -> str:
         """Return the layers that are traced, and who places samples, in words."""
@@ -368,10 +367,8 @@ def _layers(
     settings: RenderSettings, goal: Goal | None, shader: Shader
 ) -> tuple[frozenset[str], frozenset[str]]:
     """Return the layers that are asked for, and those that can be made."""
-    derived = {name for name in TABLE if TABLE[name].source == DERIVED}
     asked = frozenset(settings.layers)
-    known = shader.layers | derived
-    possible = set(known)
+    possible = shader.layers.union(name for name in TABLE if TABLE[name].source == DERIVED)
     if goal is None:
         possible -= {"error", "variance"}
     if goal is None or not goal.denoise:
@@ -379,17 +376,19 @@ def _layers(
     if settings.aamode not in DETECTORS:
         possible -= {"edges"}
     if asked == LAYERS.keys():
-        return asked & possible, frozenset(possible)
-    missing = sorted(asked - possible)
-    if "edges" in missing:
-        detectors = ", ".join(DETECTORS)
-        raise UsageError(f"layers=edges: aamode={settings.aamode} looks for none; choose one of {detectors}")
-    if not known.isdisjoint(missing):
-        raise UsageError("layers=error,variance: only rounds estimate them; give a target= or aamode=noise")
-    if missing:
-        text = f"{shader.name} does not provide these layers; use mrt_whitted"
-        raise UsageError(f"layers={','.join(missing)}: {text}")
-    return asked, frozenset(possible)
+        return asked & possible, possible
+    for name in sorted(asked - possible):
+        way = _WAYS.get(name, f"{shader.name} does not provide it; use mrt_whitted")
+        raise UsageError(f"layers={name}: {way}")
+    return asked, possible
+
+
+# What makes layers that not every render has
+_WAYS = {
+    "edges": f"give aamode={either([*DETECTORS])}, which look for edges",
+    **dict.fromkeys(("error", "variance"), "only rounds estimate them; give a target= or aamode=noise"),
+    **dict.fromkeys(("noisy", "denoised"), "give denoise=1, with a target= or spp="),
+}
 
 
 def _passes(
@@ -429,8 +428,7 @@ def _passes(
             further = replace(every, first=first, count=aa**2 - first)
             yield Refinement(layers=traced - at_centre - {"square"}, pattern=further)
     if settings.focaldist and settings.focalrange is not None:
-        focus: dict[str, Any] = {"focal_distance": settings.focaldist, "focal_range": settings.focalrange}
-        yield Blur(mode=settings.dof, **focus)
+        yield Blur(mode=settings.dof, focal_distance=settings.focaldist, focal_range=settings.focalrange)
 
 
 def _left_out(

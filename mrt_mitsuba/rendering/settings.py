@@ -229,16 +229,16 @@ class RenderSettings:
         ``stated``: the goal of the scene's integrator, used where no option sets samples per pixel. Raises
         ``UsageError`` for too few samples.
         """
-        metric = self.metric or METRIC_NAMES[0]
+        mean = self.spp or 1
+        further = (self.maxseconds, self.metric or METRIC_NAMES[0], self.denoise)
         if self.error is not None:
-            return Goal(self.error, self.maxspp or MAX_SPP, self.maxseconds, metric, self.denoise)
+            return Goal(self.error, self.maxspp or MAX_SPP, *further)
         if self.aamode == NOISE or (self.denoise and self.spp is not None and self.aamode is None):
-            mean = self.spp or 1
             if mean < MIN_SPP:
                 raise UsageError(
                     f"aamode=noise: give the mean of a pixel's samples as spp, {MIN_SPP} or more, or a target"
                 )
-            return Goal(None, min(mean, self.maxspp or mean), self.maxseconds, metric, self.denoise)
+            return Goal(None, min(mean, self.maxspp or mean), *further)
         if stated is None or self.aamode is not None or self.spp is not None:
             return None
         seconds = stated.max_seconds if self.maxseconds is None else self.maxseconds

@@ -9,7 +9,7 @@ import stat
 from collections.abc import Mapping
 from pathlib import Path
 
-from mrt_mitsuba.errors import SceneError, warn
+from mrt_mitsuba.errors import SceneError, reason, warn
 from mrt_mitsuba.options import StrPath
 
 MAX_LINE_BYTES = 2**18  # bytes, about 40,000 corners of a face
@@ -32,7 +32,7 @@ def require_file(path: StrPath) -> None:
     except (FileNotFoundError, NotADirectoryError):
         problem = f"there is no such file in {os.path.dirname(os.path.abspath(name))}"
     except (OSError, ValueError) as error:  # also of a zero byte in the name
-        problem = getattr(error, "strerror", None) or str(error)
+        problem = reason(error)
     if problem:
         raise SceneError(f"cannot read {name or repr(name)}: {problem}")
 
