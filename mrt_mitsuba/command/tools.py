@@ -13,7 +13,7 @@ import mrt_mitsuba
 from mrt_mitsuba import llvm
 from mrt_mitsuba.command.options import checked, render_parser
 from mrt_mitsuba.command.registry import COMMANDS, command_parser
-from mrt_mitsuba.errors import MrtError, SceneError, UsageError, printable
+from mrt_mitsuba.errors import MrtError, SceneError, UsageError, printable, reason
 from mrt_mitsuba.files.images import read_channels
 from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.scene.files import require_file
@@ -60,16 +60,12 @@ def doctor() -> int:
     print(choice.describe())
     start = time.perf_counter()
     try:
-        import mitsuba as mi
         import numpy as np
 
         from mrt_mitsuba import runtime
         from mrt_mitsuba.rendering.api import render
 
         print(f"variants: {', '.join(runtime.usable_variants())}")
-        reasons = {runtime.obstacle(variant): variant.split("_")[0] for variant in mi.variants()}
-        reasons.pop(None, None)  # of those that work
-        print("".join(f"  not {family}_*: {reason}\n" for reason, family in reasons.items()), end="")
         variant = runtime.use()
         image = np.asarray(render(0, width=16, height=12, aa=1, aamode="none").image)
         # the sky, exact to float32, above spheres and a plane, which differ in every channel
@@ -84,21 +80,15 @@ def doctor() -> int:
 
 
 def info(file: str) -> int:
-    """Print size, layers and header of an EXR."""
+    """Print size, channels and header of an EXR."""
     planes, headers = read_channels(file)
     channel, plane = next(iter(planes.items()))
-    layers: dict[str, list[str]] = {}
-    for name in planes:
-        layer, _, letter = name.rpartition(".")
-        layers.setdefault(layer or "picture", []).append(letter)
     print(f"{printable(file)}: {plane.shape[1]}x{plane.shape[0]} pixels, {len(planes)} channels")
-    rows = {layer: " ".join(letters) for layer, letters in layers.items()}
-    for title, entries in (("layers", rows), ("header", headers[channel])):
-        print(f"{title}:")
-        for name, value in entries.items():
-            if name != "channels":
-                value = [part.tolist() for part in value] if isinstance(value, tuple) else value
-                print(f"  {printable(name):<20} {printable(str(value))}")
+    print(f"channels: {printable(', '.join(planes))}")
+    for name, value in headers[channel].items():
+        if name != "channels":
+            value = [part.tolist() for part in value] if isinstance(value, tuple) else value
+            print(f"  {printable(name):<20} {printable(str(value))}")
     return 0
 
 
@@ -157,5 +147,5 @@ def read_toml(path: str) -> dict[str, Any]:
         with open(path, "rb") as file:
             return tomllib.load(file)
     except (SceneError, OSError, ValueError) as error:
-        text = str(getattr(error, "strerror", None) or error).removeprefix(f"cannot read {path}: ")
+        text = reason(error).removeprefix(f"cannot read {path}: ")
         raise UsageError(f"cannot read {path}: {text}") from error

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import OpenEXR
 
-from mrt_mitsuba.errors import OutputError
+from mrt_mitsuba.errors import OutputError, reason
 from mrt_mitsuba.files.images import silenced
 from mrt_mitsuba.files.replacing import TEMPORARY
 from mrt_mitsuba.sweeps.jobs import Job
@@ -33,10 +33,10 @@ def reserved(folder: str) -> Iterator[None]:
             file = stack.enter_context(open(path, "w"))
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            reason = error.strerror
+            why = reason(error)
             if isinstance(error, BlockingIOError):
-                reason = "another sweep works there; wait for it, or choose another folder"
-            raise OutputError(f"cannot write to the folder {folder}: {reason}") from None
+                why = "another sweep works there; wait for it, or choose another folder"
+            raise OutputError(f"cannot write to the folder {folder}: {why}") from None
         try:
             yield
         finally:

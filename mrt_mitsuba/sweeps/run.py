@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-import sys
-from contextlib import ExitStack, closing
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
+
+import mitsuba as mi
 
 from mrt_mitsuba import runtime, user_plugins
 from mrt_mitsuba.errors import UsageError, needs_extra
@@ -70,10 +71,9 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
         check("workers", integer(1, 65535), workers)
     if workers is not None and cluster is not None:
         raise UsageError("workers are for this machine, and a cluster brings its own: give one of them")
-    current = getattr(sys.modules.get("mitsuba"), "variant", str)()
-    if current not in (None, "", runtime.FAST) and "variant" not in (grid or {}):
-        options.setdefault("variant", current)  # workers use the variant that ``render`` would
-    named = points({} if grid is None else grid, zipped)
+    if mi.variant() not in (None, runtime.FAST) and "variant" not in (grid or {}):
+        options.setdefault("variant", mi.variant())  # workers use the variant that ``render`` would
+    named = points(grid or {}, zipped)
     folder = make_folder(out)
     shown = options.pop("progress", None) or TerminalProgress(unit=" pictures")
     modules = user_plugins.plugin_names(plugins)
@@ -91,21 +91,22 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
             if job.name in kept:
                 known = table.earlier.get(job.file, {})
                 table.add(job, known | {"file": job.file, "error": "", "versions": versions})
-        with ExitStack() as stack:
-            advance = stack.enter_context(shown.stage("Sweep", len(missing)))
+        with shown.stage("Sweep", len(missing)) as advance:
             if missing:
-                client = stack.enter_context(connected(cluster, len(missing), workers))
-                setting = {
-                    "folder": folder,
-                    "versions": versions,
-                    "sharing": inspect(client, folder, versions),
-                    "plugins": modules,
-                    "working_folder": os.getcwd() if cluster is None else None,
-                }
-                stack.callback(table.write)  # not before the workers are known to be usable
-                ending = stack.enter_context(closing(outcomes(client, missing, retries, **setting)))
-                for job, facts in ending:
-                    table.add(job, facts | {"versions": versions})
-                    advance(1)
+                with connected(cluster, len(missing), workers) as client:
+                    setting = {
+                        "folder": folder,
+                        "versions": versions,
+                        "sharing": inspect(client, folder, versions),
+                        "plugins": modules,
+                        "working_folder": os.getcwd() if cluster is None else None,
+                    }
+                    try:
+                        with closing(outcomes(client, missing, retries, **setting)) as ending:
+                            for job, facts in ending:
+                                table.add(job, facts | {"versions": versions})
+                                advance(1)
+                    finally:
+                        table.write()
         table.write()
     return table
