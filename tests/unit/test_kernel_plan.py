@@ -14,7 +14,7 @@ from cases import Cases
 from nodes import group, mesh, rgb, sensor
 
 from mrt_mitsuba.plugins.table import names_in
-from mrt_mitsuba.plugins.whitted.plan import RULES, KernelPlan, contents
+from mrt_mitsuba.plugins.whitted.plan import OTHER_SHAPES, WHAT, KernelPlan, contents
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -94,7 +94,7 @@ choice("merged", False, same=True, a=SPHERE, b=GLOSSY_CONE, light=LIGHT)
 
 def test_every_decision_is_tried():
     assert {*CHOICES, "reasons"} == {f.name for f in fields(KernelPlan)}
-    assert [rule.name for rule in RULES] == [f.name for f in fields(KernelPlan)][:-1]
+    assert list(WHAT) == [f.name for f in fields(KernelPlan)][:-1]
 
 
 @pytest.mark.parametrize("name", CHOICES)
@@ -131,7 +131,6 @@ EXACT_CONE = {**CONE, "bsdf": {"type": "mrt_bsdf", "fresnel": "dielectric"}}
 UNCLAMPED = {"type": "mrt_whitted", "clamp": False}
 SHALLOW = {"type": "mrt_whitted", "max_depth": 1}
 ROUGH_IN_PLACES = {**SPHERE, "bsdf": {"type": "mrt_bsdf", "alpha": TEXTURE}}
-OTHER_SHAPES = "other shapes, or spheres that emit or face inwards"
 OTHER_LIGHT = f"a light other than {names_in('lights')}, or one with derivatives"
 reason("bvh", "no shapes but analytic ones", a=CONE)
 reason("spheres", OTHER_SHAPES, a=SPHERE, b=MESH)
