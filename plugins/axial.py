@@ -41,7 +41,6 @@ class AxialMesh(mi.Mesh):
             raise ParameterError(f'{name}: "face_normals" is not accepted; its side is round')
         self.placement = Placement(props)
         self.unit = KINDS[self.kind].mesh(segments(props, 256))
-        self.flipped = props.get("flip_normals", False)
         self._place(*ends, [radius])
         vertices, faces = self.unit
         buffers = {"has_vertex_normals": True, "has_vertex_texcoords": True}
@@ -55,7 +54,7 @@ class AxialMesh(mi.Mesh):
     def _place(self, *parameters: Sequence) -> None:
         """Make the table of the exact quadric, in double precision, from both ends and [radius]."""
         numbers = np.array([[first(x) for values in parameters for x in values]])
-        self.table = QuadricTable(self.kind, numbers, self.placement, self.unit, flipped=self.flipped)
+        self.table = QuadricTable(self.kind, numbers, self.placement, self.unit)
 
     def _frame(self) -> Frame:
         """Return the unit frame in Mitsuba's numbers, with derivatives by the parameters."""

@@ -48,8 +48,7 @@ class MrtGroup(mi.Mesh):
         attributes = {name: _table(props, name) for name in props if name.startswith("face_")}
         self.content = f"kind={kind}, objects={len(numbers)}"
         unit = KINDS[kind].mesh(segments(props, 8))
-        flipped = props.get("flip_normals", False)
-        self.table = QuadricTable(kind, numbers, Placement(props), unit, flipped=flipped)
+        self.table = QuadricTable(kind, numbers, Placement(props), unit)
         vertices, faces = map(len, unit)
         sizes = len(numbers) * vertices, len(numbers) * faces
         mi.Mesh.__init__(self, "mrt_group", *sizes, props, has_vertex_normals=True)

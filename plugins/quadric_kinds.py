@@ -193,25 +193,35 @@ class Axial:
         return p - n * distance, n, u, dr.clip(v, 0, 1), around, make(along)
 
     def mesh(self, segments: int) -> UnitMesh:
-        """Return rings around the axis, joined by triangles, and the discs of a closed one as fans."""
+        """Return the bands of the side, and the discs of a closed one."""
         steps = min(segments // 2, MAX_RINGS) if self.curved else 1
         z, radius = self.outline(np.linspace(0, 1, steps + 1)[:, None])  # [rings, 1]
         _, by_r, by_z = self.side(radius, z)
-        # At an apex, each triangle has a vertex and a normal of its own
-        turn = (np.arange(segments + 1) - 0.5 * (radius == 0)) / segments
-        x = np.cos(2 * np.pi * turn)
-        y = np.sin(2 * np.pi * turn)
-        columns = radius * x, radius * y, z, by_r * x, by_r * y, by_z, turn, 1 - z
-        vertices = np.stack(np.broadcast_arrays(*columns), axis=-1).reshape(-1, 8)
-        k = np.arange(len(vertices)).reshape(steps + 1, -1)
-        lower = np.stack([k[:-1, :-1], k[:-1, 1:], k[1:, :-1]], axis=-1)
-        upper = np.stack([k[1:, :-1], k[:-1, 1:], k[1:, 1:]], axis=-1)
-        faces = np.concatenate([lower[int(self.apex) :], upper]).reshape(-1, 3)
+        vertices, faces = _bands(segments, z, radius, by_r, by_z)
         for end in self.parts[1:] if self.closed else ():
-            rim, fan = _disc(segments, end)
+            # From the rim to the centre at z = 1, and back at z = 0
+            z, radius, up = (1, [[1], [0]], 1) if end == BASE else (0, [[0], [1]], -1)
+            more, fan = _bands(segments, z, np.array(radius), 0, up)
+            more[:, 6:] = 0.5 + 0.5 * more[:, :2]
             faces = np.concatenate([faces, fan + len(vertices)])
-            vertices = np.concatenate([vertices, rim])
+            vertices = np.concatenate([vertices, more])
         return vertices, faces
+
+
+def _bands(segments: int, z, radius: np.ndarray, by_r, by_z) -> UnitMesh:
+    """Return rings around the axis, joined by triangles; ``radius`` and what is not the same: [rings, 1]."""
+    # In a point, each triangle has a vertex and a normal of its own
+    turn = (np.arange(segments + 1) - 0.5 * (radius == 0)) / segments
+    x = np.cos(2 * np.pi * turn)
+    y = np.sin(2 * np.pi * turn)
+    columns = radius * x, radius * y, z, by_r * x, by_r * y, by_z, turn, 1 - z
+    vertices = np.stack(np.broadcast_arrays(*columns), axis=-1)
+    k = np.arange(turn.size).reshape(turn.shape)
+    lower = np.stack([k[:-1, :-1], k[:-1, 1:], k[1:, :-1]], axis=-1)
+    upper = np.stack([k[1:, :-1], k[:-1, 1:], k[1:, 1:]], axis=-1)
+    is_point = radius[:, 0] == 0
+    faces = np.concatenate([lower[~is_point[:-1]], upper[~is_point[1:]]])
+    return vertices.reshape(-1, 8), faces.reshape(-1, 3)
 
 
 def inside_cone(p, u):
@@ -279,7 +289,7 @@ _CONE = Axial(
 _CYLINDER = Axial(
     interval=inside_cylinder,
     side=lambda r, z: (r - 1, 1, 0),
-    outline=lambda s: (s, 1.0),
+    outline=lambda s: (s, s**0),
     hull=(DISC, DISC),
 )
 
@@ -319,17 +329,3 @@ def _line(o, d):
         return (s - (along + rest)) / length
 
     return p - u * rest, u, t_of
-
-
-def _disc(segments: int, part: int) -> UnitMesh:
-    """Return a fan around the centre, facing away from z = 1/2."""
-    i = np.arange(segments)
-    azimuth = 2 * np.pi * i / segments
-    vertices = np.zeros((segments + 1, 8))  # the centre comes last
-    vertices[:-1, 0] = np.cos(azimuth)
-    vertices[:-1, 1] = np.sin(azimuth)
-    vertices[:, 2] = 1 if part == BASE else 0
-    vertices[:, 5] = 1 if part == BASE else -1
-    vertices[:, 6:] = 0.5 + 0.5 * vertices[:, :2]
-    faces = np.stack([i, (i + 1) % segments, np.full_like(i, segments)], axis=1)
-    return vertices, faces if part == BASE else faces[:, ::-1]

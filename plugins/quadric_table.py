@@ -16,23 +16,16 @@ class QuadricTable:
     """Objects of one kind, by their unit frames, and the mesh that stands for each."""
 
     def __init__(
-        self,
-        kind: str,
-        numbers: np.ndarray,
-        place: Callable[[Frame], Frame],
-        unit: UnitMesh,
-        *,
-        flipped: bool,
+        self, kind: str, numbers: np.ndarray, place: Callable[[Frame], Frame], unit: UnitMesh
     ) -> None:
         """Read the ``numbers`` of the objects, float64 [n, width], and move each by ``place``.
 
-        ``unit``: the stand-in in the unit frame. ``flipped``: the normals point inwards.
+        ``unit``: the stand-in in the unit frame.
         """
         points = [Columns.of(numbers[:, 3 * k : 3 * k + 3]) for k in range(KINDS[kind].points)]
         frame = place(KINDS[kind].frame(*points, column(numbers[:, -1])))
         self.kind = kind
         self.unit = unit
-        self.flipped = flipped
         self.origins = frame.origin.array()  # float64 [n, 3]
         self.rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)  # [n, 3, 3]
         #: the first face of each stand-in, int [n], for textures that are looked up by face
@@ -48,19 +41,6 @@ class QuadricTable:
         low = (centers - half).min(axis=1)
         high = (centers + half).max(axis=1)
         return np.stack([low, high], axis=1)
-
-    def numbers(self, kinds: list[str]) -> np.ndarray:
-        """Return the numbers that a kernel for such kinds reads of each object, [n, 4, 4]: four at a time.
-
-        A row and a coordinate of the origin, three times; kind, size of coordinates, 0, side of the normal.
-        """
-        numbers = np.zeros((len(self.rows), 4, 4))
-        numbers[:, :3, :3] = self.rows
-        numbers[:, :3, 3] = self.origins
-        numbers[:, 3, 0] = kinds.index(self.kind)
-        numbers[:, 3, 1] = np.abs(self.boxes()).max(axis=(1, 2))
-        numbers[:, 3, 3] = -1 if self.flipped else 1
-        return numbers
 
     def proxy_mesh(self) -> dict[str, np.ndarray]:
         """Return the buffers of a mesh of all objects; frames may be left-handed."""

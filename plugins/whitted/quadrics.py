@@ -32,7 +32,8 @@ class Quadrics:
         counts = [len(t.rows) for t in tables]
         self.count = sum(counts)
         self.kinds = sorted({t.kind for t in tables})  # the kernel holds these only
-        self.flipped = any(t.flipped for t in tables)
+        sides = [-1 if s.has_flipped_normals() else 1 for s in shapes]
+        self.flipped = -1 in sides
         self._boxes = np.concatenate([t.boxes() for t in tables])
         self.leaf_of = np.arange(self.count)
         leaves = self.count
@@ -40,8 +41,14 @@ class Quadrics:
             self.tree = Tree(self._boxes)
             self.leaf_of = self.tree.leaf_of
             leaves = self.tree.leaves
+        # A row and a coordinate of the origin, three times; then kind, size of coordinates, 0, side of the
+        # normal: a kernel reads four at a time
         numbers = np.zeros((leaves, 4, 4))
-        numbers[self.leaf_of] = np.concatenate([t.numbers(self.kinds) for t in tables])
+        numbers[self.leaf_of, :3, :3] = np.concatenate([t.rows for t in tables])
+        numbers[self.leaf_of, :3, 3] = np.concatenate([t.origins for t in tables])
+        numbers[self.leaf_of, 3, 0] = np.repeat([self.kinds.index(t.kind) for t in tables], counts)
+        numbers[self.leaf_of, 3, 1] = np.abs(self._boxes).max(axis=(1, 2))
+        numbers[self.leaf_of, 3, 3] = np.repeat(sides, counts)
         self.numbers = Table(mi.Vector4f, numbers)
         faces = np.zeros(leaves, int)
         faces[self.leaf_of] = np.concatenate([t.first_faces for t in tables])
