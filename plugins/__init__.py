@@ -58,10 +58,7 @@ def plugin(name: str, package: str = __name__) -> ModuleType:
             source = importlib.util.find_spec(f"{package}.{name}")
             origin = source.origin if source else None
             spec = importlib.util.spec_from_file_location(f"{package}.{name}_{key[0]}", origin)
-            if spec is None or spec.loader is None:
-                raise ImportError(
-                    f"the plugin module {name} is missing in {package}: install the package anew"
-                )
+            assert spec and spec.loader, f"{package} has no module {name}"
             module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
             spec.loader.exec_module(module)
             _loaded[key] = module

@@ -8,8 +8,8 @@ import numpy as np
 from .mesh_api import Placement, write_buffers
 from .parameters import ParameterError, bitmap
 
-# Vertex attributes, and their channels in the bitmap: as many as are used, or more
-_EXTRAS = {"texcoords": (2, 3), "normals": (3,)}
+# Arrays of the vertices, and their channels in the bitmap: as many as are used, or more
+_CHANNELS = {"positions": (3,), "texcoords": (2, 3), "normals": (3,)}
 
 
 class MrtMesh(mi.Mesh):
@@ -34,36 +34,35 @@ class MrtMesh(mi.Mesh):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        positions = _array(props, "positions", 3)
         faces = _array(props, "faces", 3)
-        extras = {
-            name: _array(props, name, *widths)[:, : widths[0]]
-            for name, widths in _EXTRAS.items()
-            if name in props
+        arrays = {
+            name: _array(props, name, *channels)[:, : channels[0]]
+            for name, channels in _CHANNELS.items()
+            if name in props or name == "positions"
         }
-        if "normals" in extras and props.get("face_normals", False):
+        smooth = "normals" in arrays
+        if smooth and props.get("face_normals", False):
             raise ParameterError('mrt_mesh: give "normals" or "face_normals", not both')
         if (faces % 1).any():
             raise ParameterError('mrt_mesh: "faces" holds a number that is not whole')
-        count = len(positions)
+        count = len(arrays["positions"])
         wrong = faces[(faces < 0) | (faces >= count)]
         if len(wrong):
             raise ParameterError(f'mrt_mesh: "faces" holds {wrong[0]}, but there are {count} positions')
-        for name, array in extras.items():
+        for name, array in arrays.items():
             if len(array) != count:
                 raise ParameterError(f'mrt_mesh: "{name}" has {len(array)} entries for {count} positions')
         if "to_world" in props:
             placement = Placement(props)
-            positions = placement.points(positions.astype(np.float64))
+            arrays["positions"] = placement.points(arrays["positions"].astype(np.float64))
             faces = faces[:, ::-1] if placement.mirrors else faces
-            if "normals" in extras:
-                extras["normals"] = extras["normals"] @ placement.inverse
-        if "normals" in extras:
-            lengths = np.linalg.norm(extras["normals"], axis=1, keepdims=True)
-            extras["normals"] = extras["normals"] / np.where(lengths == 0, 1, lengths)
-        buffers = {f"has_vertex_{name}": name in extras for name in _EXTRAS}
+            if smooth:
+                arrays["normals"] = arrays["normals"] @ placement.inverse
+        if smooth:
+            lengths = np.linalg.norm(arrays["normals"], axis=1, keepdims=True)
+            arrays["normals"] = arrays["normals"] / np.where(lengths == 0, 1, lengths)
+        buffers = {"has_vertex_normals": smooth, "has_vertex_texcoords": "texcoords" in arrays}
         mi.Mesh.__init__(self, "mrt_mesh", count, len(faces), props, **buffers)
-        arrays = {"positions": positions, **extras}
         flat = {f"vertex_{name}": array.astype(np.float32).ravel() for name, array in arrays.items()}
         write_buffers(self, **flat, faces=faces.astype(np.uint32).ravel())
         self.content = f"positions={count}, faces={len(faces)}"

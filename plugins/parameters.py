@@ -57,12 +57,11 @@ def number(
     return rounded
 
 
-def integer(props: mi.Properties, name: str, default: int, *, least: int, most: float = math.inf) -> int:
+def integer(props: mi.Properties, name: str, default: int, *, least: int, most: int) -> int:
     """Return an integer parameter from ``least`` to ``most``."""
     value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        limits = f">= {least}" if most == math.inf else f"from {least} to {most}"
-        _fail(props, name, value, f"an integer {limits}")
+    if type(value) is not int or not least <= value <= most:
+        _fail(props, name, value, f"an integer from {least} to {most}")
     return value
 
 

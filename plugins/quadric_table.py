@@ -22,12 +22,14 @@ class QuadricTable:
 
         ``unit``: the stand-in in the unit frame.
         """
-        points = [Columns.of(numbers[:, 3 * k : 3 * k + 3]) for k in range(KINDS[kind].points)]
-        frame = place(KINDS[kind].frame(*points, column(numbers[:, -1])))
+        *columns, radii = map(column, numbers.T)
+        points = [Columns(columns[k : k + 3]) for k in range(0, len(columns), 3)]
+        frame = place(KINDS[kind].frame(*points, radii))
         self.kind = kind
         self.unit = unit
-        self.origins = frame.origin.array()  # float64 [n, 3]
-        self.rows = np.stack([row.array() for row in (frame.x, frame.y, frame.z)], axis=1)  # [n, 3, 3]
+        self.origins = np.stack(frame.origin, axis=1)  # float64 [n, 3]
+        rows = [np.stack(row, axis=1) for row in (frame.x, frame.y, frame.z)]
+        self.rows = np.stack(rows, axis=1)  # [n, 3, 3]
         #: the first face of each stand-in, int [n], for textures that are looked up by face
         self.first_faces = len(unit[1]) * np.arange(len(numbers))
 
@@ -64,26 +66,12 @@ class Columns(list):
 
     x, y, z = (property(itemgetter(k)) for k in range(3))
 
-    @classmethod
-    def of(cls, array: np.ndarray) -> Columns:
-        """Return the float64 columns of an array [n, 3]."""
-        return cls(column(array[:, k]) for k in range(3))
-
-    def array(self) -> np.ndarray:
-        """Return the array [n, 3] of the columns."""
-        return np.stack([np.array(c) for c in self], axis=1)
-
-    def __add__(self, other) -> Columns:
-        return Columns(a + b for a, b in zip(self, other, strict=True))
-
     def __sub__(self, other) -> Columns:
         return Columns(a - b for a, b in zip(self, other, strict=True))
 
-    def __mul__(self, factor) -> Columns:
-        return Columns(a * factor for a in self)
-
     def __truediv__(self, divisor) -> Columns:
-        return self * (1 / divisor)
+        inverse = 1 / divisor
+        return Columns(a * inverse for a in self)
 
 
 def column(values: np.ndarray):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import signal
 import traceback
 from collections.abc import Sequence
@@ -255,11 +254,8 @@ class MrtWhitted(mi.SamplingIntegrator):
         # Finite, as an infinite one times no light would be NaN
         throughput = dr.minimum(path.throughput * reflectance, LARGEST)
         depth = path.depth + cost
-        brightest = dr.max(throughput)
-        if data.plan.contribution_bounds[0] == math.inf:
-            goes_on = (depth < self.max_depth) & (brightest > 0)
-        else:
-            goes_on = (depth < self.max_depth) & (brightest * data.path_bound > self.min_contribution)
+        # Without a known bound, paths end where nothing is left: zero times infinity exceeds nothing
+        goes_on = (depth < self.max_depth) & (dr.max(throughput) * data.path_bound > self.min_contribution)
         after = Path(
             data.mirror_ray(path.ray, hit),
             throughput=throughput,

@@ -24,24 +24,21 @@ def material_rows(shapes: Sequence[mi.Shape]) -> tuple[list[np.ndarray], str]:
     """Return the ``fixed_row`` of the material of each shape, and ""; or none of them, and the reason why
     they have no place in one table."""
     bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
+    if not is_jit():
+        return [], SCALAR_VARIANT
+    if mi.is_spectral:
+        return [], "a spectral variant"
+    if any(s.class_name() == "Instance" for s in shapes):  # inside, shapes are not the scene's own
+        return [], "instances in the scene"
     # Of the class itself: one derived from it may have other lobes
-    mergeable = bool(bsdfs) and all(map(is_mrt_bsdf, bsdfs.values()))
-    obstacles = {
-        SCALAR_VARIANT: not is_jit(),
-        "a spectral variant": mi.is_spectral,
-        # Inside an instance, shapes are not the scene's own
-        "instances in the scene": any(s.class_name() == "Instance" for s in shapes),
-        f"a material other than {names_in('materials')}": not mergeable,
-    }
+    if not (bsdfs and all(map(is_mrt_bsdf, bsdfs.values()))):
+        return [], f"a material other than {names_in('materials')}"
     for name in CHOICES:
-        different = mergeable and len({b.choices[name] for b in bsdfs.values()}) > 1
-        obstacles[f'materials of different "{name}"'] = different
-    reasons = [why for why, holds in obstacles.items() if holds]
-    rows = {} if reasons else {key: bsdf.fixed_row() for key, bsdf in bsdfs.items()}
-    reasons += [row for row in rows.values() if isinstance(row, str)]
-    if reasons:
-        return [], reasons[0]
-    return [rows[id(s.bsdf())] for s in shapes], ""
+        if len({b.choices[name] for b in bsdfs.values()}) > 1:
+            return [], f'materials of different "{name}"'
+    rows = {key: bsdf.fixed_row() for key, bsdf in bsdfs.items()}
+    obstacle = next((row for row in rows.values() if isinstance(row, str)), "")
+    return [] if obstacle else [rows[id(s.bsdf())] for s in shapes], obstacle
 
 
 class MaterialTable:

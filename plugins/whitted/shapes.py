@@ -133,10 +133,12 @@ class Spheres:
     def boxes(self) -> tuple[np.ndarray, np.ndarray, bool]:
         """Return the boxes [n, 2, 3] of the spheres, their numbers, and that they are balls; they are then
         ready for ``block``."""
-        frames = []
-        for shape in self.shapes:
-            value, kind = next(how for name, *how in parameters_of(shape) if name == "to_world")
-            frames.append(mi.get_property(value, kind, shape).matrix)
+        frames = [
+            mi.get_property(value, kind, shape).matrix
+            for shape in self.shapes
+            for name, value, kind in parameters_of(shape)
+            if name == "to_world"
+        ]
         numbers = np.array([[first(m[row][column]) for row in range(3) for column in (0, 3)] for m in frames])
         # To the last bit, which Mitsuba's boxes do not have
         centers = numbers[:, 1::2]

@@ -83,14 +83,12 @@ class SnapshotPart:
             return
         own = getattr(thing, "__dict__", None) or {}  # of a class in Python
         for name, value, kind in [*parameters_of(thing), *((name, own[name], None) for name in own)]:
-            if isinstance(value, mi.Object):
-                if isinstance(value, elsewhere):
-                    continue
-                self.state.append(name)
-                self.add(value, elsewhere)
+            if isinstance(value, elsewhere):
                 continue
             self.state.append(name)
-            if kind is None:
+            if isinstance(value, mi.Object):
+                self.add(value, elsewhere)
+            elif kind is None:
                 self._add_value(value)
             else:  # made for this look at it
                 self._add_value(mi.get_property(value, kind, thing), in_words=True)
