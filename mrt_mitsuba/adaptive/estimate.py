@@ -337,9 +337,6 @@ def ray_variance(
     weights = _mixture(parts, measured)
     weights[0] = max(weights[0], unseen / max(effective_number(both), 1))
     mixed = np.tensordot(weights.astype(np.float32), more, 1)
-    quiet, also = window_means(np.stack([seen, measured]), 1) == 0
-    if not (measured[quiet].any() or seen[also].any()):  # where one met no noise, the other met none
-        mixed[quiet & also] = 0
     mixed[..., stats.scale == 0] = 0
     every = differences(first, second)
     found, expected = window_means(every, WINDOWS[-1]) + 0.2 * every.mean((-2, -1), keepdims=True)

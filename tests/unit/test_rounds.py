@@ -372,6 +372,23 @@ def test_quiet_pixels_get_rays_enough_to_meet_a_lamp_in_a_mirror():
     assert all(r.samples.min() > 8 for r in results)
 
 
+def test_a_lamp_that_pilots_missed_gets_rays(monkeypatch):
+    """It lights one pixel, and half of the rays there; in no pixel around it do pilots meet noise."""
+    monkeypatch.setattr(rounds, "MIN_RAYS", 0)  # which show it in small pictures
+
+    def missed(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
+        return np.where(pixel < 16, rng.exponential(size=len(pixel)), 1)
+
+    def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
+        return missed(rng, pixel) + 2 * ((pixel == 130) & (rng.random(len(pixel)) < 0.5))
+
+    exposer = Draws(draw)
+    exposer.draws[2:] = 2 * [missed]
+    result = _render(exposer, target=0.01, rays=4096)
+    assert result.error.rmse <= 0.01
+    assert result.samples[8, 2] > 64
+
+
 def test_noise_of_any_size_ends_without_a_warning_of_numpy():
     """Scouts without noise, halves with some; and rare rays so bright that counts would overflow."""
     quiet = _render(Draws(_calm, 2, lambda rng, pixel: np.ones(len(pixel))), target=10, rays=64)
