@@ -72,7 +72,9 @@ def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[st
         parts = {f"{name}.png": image["data"] for name, image in images[study.name].items()}
         for name, table in study.tables.items():
             text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows([table["columns"], *table["rows"]])
+            writer = csv.DictWriter(text, [*table["rows"][0]], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(table["rows"])
             parts[f"{name}.csv"] = text.getvalue().encode()
         for name, data in parts.items():
             words = (re.sub(r"[^A-Za-z0-9.]+", "-", n).strip("-.").lower() for n in (study.name, name))

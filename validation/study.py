@@ -42,7 +42,7 @@ class Study:
     title: str
     progress: Progress = field(default_factory=Progress)
     texts: list[str] = field(default_factory=list)  # paragraphs
-    tables: dict[str, Values] = field(default_factory=dict)  # title, columns, rows, note, first
+    tables: dict[str, Values] = field(default_factory=dict)  # title, rows, note, first
     images: dict[str, Values] = field(default_factory=dict)  # title, content, caption
     bounds: list[Bound] = field(default_factory=list)
     seconds: float = 0.0  # that it took
@@ -90,9 +90,7 @@ class Study:
 
         It is also written as CSV; ``first``: an answer, shown before the pictures.
         """
-        columns = [*rows[0]] if rows else []
-        values = [[*row.values()] for row in rows]
-        self.tables[name] = {"title": title, "columns": columns, "rows": values, "note": note, "first": first}
+        self.tables[name] = {"title": title, "rows": rows, "note": note, "first": first}
 
     def picture(self, name: str, title: str, content: Any, caption: str = "") -> None:
         """Add a linear picture [H, W, 3] or a matplotlib figure, with a caption that says what it shows."""

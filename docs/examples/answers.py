@@ -106,10 +106,7 @@ def hard_axes() -> Answer:
 
 def _shown(study: Study, name: str) -> tuple[list[Any], Rows]:
     """The plots of a study, and the rows of one of its tables."""
-    table = study.tables[name]
-    rows = [
-        dict(zip(table["columns"], row, strict=True)) for row in table["rows"]
-    ]
+    rows = study.tables[name]["rows"]
     return [image["content"] for image in study.images.values()], rows
 
 

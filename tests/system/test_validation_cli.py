@@ -79,7 +79,10 @@ def test_everything_a_study_finds_is_written(validate, tmp_path, capsys):
     assert (found["title"], found["verdict"]) == (TITLE, "passed")
     bound = {"name": "largest error", "measured": 1e-6, "limit": 1e-5, "sense": "<=", "holds": True}
     assert found["bounds"][0] == {**bound, "note": "a reason"}
-    rows = [["Ag", 0.123456789, 2], ["Cu", "Infinity", 12345678]]
+    rows = [
+        {"metal": "Ag", "error": 0.123456789, "n": 2},
+        {"metal": "Cu", "error": "Infinity", "n": 12345678},
+    ]
     assert found["tables"]["errors"]["rows"] == rows
     assert (tmp_path / "good-errors.csv").read_text().startswith("metal,error,n\nAg,0.123456789,2\n")
     assert "ok     largest error: 1e-06 <= 1e-05" in capsys.readouterr().out
