@@ -58,7 +58,7 @@ def test_render_gives_the_same_picture(name: str, originals: Path) -> None:
 def reference_picture(number: int) -> np.ndarray:
     """The float64 reference's picture of a scene of the report, one pixel in 4. [120, 160, 3]"""
     corner = (-0.25, -0.25)  # from the middle of four pixels to the lower left one
-    return reference_render(report_scene(number), width=160, height=120, displacement=corner).image
+    return reference_render(report_scene(number), width=160, height=120, displacement=corner)
 
 
 @pytest.mark.parametrize("number", [0, 1, 2, 3, pytest.param(4, marks=pytest.mark.slow), 9])

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from functools import singledispatch
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.linalg import norm
@@ -27,20 +27,8 @@ from mrt_mitsuba.scene.model import OBJECTS, Cone, Cylinder, Mesh, Plane, Scene,
 OFFSET = 1e-10
 BATCH = 2**20  # pairs of a ray and a triangle at a time
 NOTHING = (1, 1, 0, 0, 0)  # index, roughness and colour of what a ray meets that meets no object
-HASH = np.uint64(0x9E3779B97F4A7C15)  # odd, so that no step of the hash loses information
 
 Array = np.ndarray
-
-
-class ReferenceResult(NamedTuple):
-    """A picture in linear RGB, top row first, and a hash of the decisions behind each pixel.
-
-    Two renders of a scene have the same one in a pixel if all rays met the same objects in the same order,
-    and at each of them the same lights were in front and in sight.
-    """
-
-    image: Array  # float64 [H, W, 3]
-    decisions: Array  # uint64 [H, W]
 
 
 def reference_render(
@@ -51,8 +39,10 @@ def reference_render(
     displacement: Sequence[float] = (0, 0),
     fresnel: str = "dielectric",
     clamp: bool = True,
-) -> ReferenceResult:
+) -> Array:
     """Render a scene with one ray through each pixel, exactly to the rounding of float64.
+
+    Return the picture in linear RGB, float64 [H, W, 3], top row first.
 
     ``displacement``: of the rays, in pixels, y upwards. ``fresnel``: "dielectric" or "unity". ``clamp``: each
     light's part to [0, 1], as the report does. Textures are drawn on triangles only, as in the report.
@@ -70,18 +60,16 @@ def reference_render(
     v = (2 * y - height) / width * half_width
     d = unit(forward + u[:, None] * right + v[:, None] * np.cross(forward, right))
     o = np.broadcast_to(np.array(camera.position, float), d.shape)
-    layers = _radiance(scene, o, d, fresnel, clamp)
-    return ReferenceResult(*(layer.reshape(height, width, *layer.shape[1:])[::-1] for layer in layers))
+    return _radiance(scene, o, d, fresnel, clamp).reshape(height, width, 3)[::-1]
 
 
 @np.errstate(all="ignore")
-def _radiance(scene: Scene, o: Array, d: Array, fresnel: str, clamp: bool) -> tuple[Array, Array]:
-    """The light [N, 3] that comes back along rays, and the hashes of their decisions [N]."""
+def _radiance(scene: Scene, o: Array, d: Array, fresnel: str, clamp: bool) -> Array:
+    """The light [N, 3] that comes back along rays."""
     things = [*chain.from_iterable(getattr(scene, f"{kind}s") for kind in OBJECTS), *scene.meshes]
     materials = [thing.material for thing in things]
     numbers = np.array([*((m.ior, m.alpha, *m.specular) for m in materials), NOTHING])
     light = np.zeros(d.shape)
-    decisions = np.zeros(len(d), np.uint64)
     rays = [np.arange(len(d)), np.ones(d.shape), np.zeros(len(d), int), o, d]
     while len(rays[0]):
         ray, weight, spent, o, d = rays
@@ -94,7 +82,6 @@ def _radiance(scene: Scene, o: Array, d: Array, fresnel: str, clamp: bool) -> tu
         specular = np.transpose(specular)
         start = p + (OFFSET * (abs(o).max(axis=1) + t))[:, None] * n
 
-        seen = np.zeros(len(ray), int)
         for lamp in scene.lights:
             to_light = unit(lamp.position - p)
             way = lamp.position - start
@@ -102,25 +89,19 @@ def _radiance(scene: Scene, o: Array, d: Array, fresnel: str, clamp: bool) -> tu
             shadow = unit(way[facing])
             reach = norm(way[facing], axis=1)
             lit = facing[nearest(things, start[facing], shadow, reach)[1] < 0]
-            seen *= 3
-            seen[facing] += 1
-            seen[lit] += 1
             lobe = specular_lobe(n[lit], to_light[lit], -d[lit], alpha[lit])
             lobe *= reflectance(fresnel, dot(unit(to_light - d), to_light)[lit], ior[lit])
             # The G₁ of a negative roughness can be negative; light cannot
             value = np.maximum(diffuse[lit] / math.pi + specular[lit] * lobe[:, None], 0)
             value = value * dot(n, to_light)[lit, None] * lamp.color
             light[ray[lit]] += weight[lit] * (np.clip(value, 0, 1) if clamp else value)
-        # continued by two more numbers
-        hashed = (decisions[ray] * HASH ^ (thing + 2).astype(np.uint64)) * HASH
-        decisions[ray] = (hashed ^ seen.astype(np.uint64)) * HASH
 
         weight = weight * specular * reflectance(fresnel, cos, ior)[:, None]
         spent += np.maximum(1, 10 - (10 * ior).astype(int))  # the report's budget of bounces
         on = (cos > 0) & (spent < 10) & (weight != 0).any(axis=1)
         d = unit(d + 2 * cos[:, None] * n)
         rays = [x[on] for x in (ray, weight, spent, start, d)]
-    return light, decisions
+    return light
 
 
 def unit(v: Any) -> Array:

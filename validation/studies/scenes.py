@@ -18,7 +18,6 @@ STEP = 1 / 255  # of an 8-bit picture: invisible
 # Pixels. Float32 places a ray to about 1e-5 of a pixel, and mirrors of small spheres enlarge that a hundred
 # times; where so small a move changes what a ray meets, float32 may meet the other
 DISPLACEMENT = 1e-3
-REASONS = ("edge", "steep shading", "unexplained")
 # Bounds for 99 of 100 pixels of scenes 0 to 9, three times what was measured: what is left there is rounding
 # in mirrors and highlights, of alpha 1e-3 in scene 3, of balls in scene 4
 MOST = (5e-7, 1e-5, 1.5e-5, 3e-6, 3e-5, 1e-6, 6e-7, 5e-7, 3e-7, 9e-7)
@@ -27,20 +26,18 @@ MOST = (5e-7, 1e-5, 1.5e-5, 3e-6, 3e-5, 1e-6, 6e-7, 5e-7, 3e-7, 9e-7)
 def judge(image: np.ndarray, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Judge a linear picture [H, W, 3] with one sample a pixel and the exact Fresnel factor.
 
-    Return the error [H, W], the largest difference in a channel; and the reason [H, W], an index in
-    ``REASONS`` where the error exceeds a step of an 8-bit picture, else -1. Such a pixel is on an edge, of a
-    silhouette or a shadow, if a ray moved by ``DISPLACEMENT`` pixels meets other things or other lights; on
-    steep shading if that changes its colour by as much; or unexplained.
+    Return the error [H, W], the largest difference in a channel; and where nothing explains it [H, W]: it
+    exceeds a step of an 8-bit picture, and a ray moved by ``DISPLACEMENT`` pixels, across the edge of a
+    silhouette or a shadow or along steep shading, changes the colour by less than half of it.
     """
     size = {"height": image.shape[0], "width": image.shape[1]}
     truth = reference_render(scene, **size)
-    error = abs(image - truth.image).max(axis=-1)
+    error = abs(image - truth).max(axis=-1)
     off = ~(error <= STEP)
     steps = DISPLACEMENT * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
     moved = [reference_render(scene, displacement=step, **size) for step in steps if off.any()]
-    edge = np.any([other.decisions != truth.decisions for other in moved], axis=0)
-    spread = np.max([abs(other.image - truth.image).max(axis=-1) for other in moved], axis=0, initial=0)
-    return error, np.select([~off, edge, error <= spread], [-1, 0, 1], 2)
+    spread = np.max([abs(other - truth).max(axis=-1) for other in moved], axis=0, initial=0)
+    return error, off & ~(error <= 2 * spread)
 
 
 def draw(scene: Scene | int, size: tuple[int, int], **integrator: Any) -> np.ndarray:
@@ -50,7 +47,7 @@ def draw(scene: Scene | int, size: tuple[int, int], **integrator: Any) -> np.nda
     return mrt.render(scene, **{**options, "fresnel": "dielectric", "integrator": settings}).image
 
 
-def hold(study: Study, number: int, error: np.ndarray, reason: np.ndarray) -> None:
+def hold(study: Study, number: int, error: np.ndarray, unexplained: np.ndarray) -> None:
     """Hold a scene that was judged to its bounds."""
     edges = "rounding sends single pixels to the other side of an edge: measured up to two in ten thousand"
     least = f"least fault: 1 % off by {MOST[number]:g}"
@@ -58,7 +55,7 @@ def hold(study: Study, number: int, error: np.ndarray, reason: np.ndarray) -> No
         "median difference": (np.median(error), 1e-7, "least fault: half of the pixels off by 1e-7"),
         "difference of 99 %": (np.quantile(error, 0.99), MOST[number], least),
         "share of pixels off by > 1/255": (np.mean(error > STEP), 5e-4, edges),
-        "pixels off without a reason": (np.sum(reason == 2), 0, "reasons are found by rays that are moved"),
+        "pixels off without a reason": (unexplained.sum(), 0, "a ray moved a little explains all others"),
     }
     for what, bound in found.items():
         study.at_most(f"scene {number}: {what}", *bound)
@@ -66,13 +63,7 @@ def hold(study: Study, number: int, error: np.ndarray, reason: np.ndarray) -> No
 
 def run(study: Study, *, quick: bool) -> None:
     """Judge our pictures of all scenes."""
-    rows = []
     size = (48, 36) if quick else (160, 120)
     for number in study.each("Scenes in float64", range(len(MOST))):
         scene = report_scene(number)
-        error, reason = judge(draw(scene, size), scene)
-        counts = {word: int(np.sum(reason == i)) for i, word in enumerate(REASONS)}
-        hold(study, number, error, reason)
-        rows.append({"scene": number, **counts})
-    note = f"{size[0]}x{size[1]}, one sample a pixel. By reason: pixels off by more than 1/255."
-    study.records("scenes", "Our pictures against the float64 tracer", rows, note)
+        hold(study, number, *judge(draw(scene, size), scene))

@@ -99,7 +99,7 @@ def light_paths(study: Study, *, quick: bool) -> None:
 def path_error(scene: Scene, *, fresnel: str = "dielectric", clamp: bool = True) -> float:
     """Return the largest difference in a channel that 95 % of the pixels stay below; inf for bad values."""
     size: Values = {"width": 64, "height": 48}
-    truth = reference_render(scene, **size, fresnel=fresnel, clamp=clamp).image
+    truth = reference_render(scene, **size, fresnel=fresnel, clamp=clamp)
     nodes = scene.to_dict(**size, fresnel=fresnel)
     nodes["integrator"] = {"type": "mrt_whitted", "clamp": clamp, "min_contribution": 0.0}
     image = render(nodes, aa=1, lattice="report").image
