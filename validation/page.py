@@ -95,18 +95,16 @@ def _files(studies: Sequence[Study], title: str, quick: bool = False) -> dict[st
 
 
 def _drawn(content: Any) -> Values:
-    """Return the bytes of a PNG, the class of the picture, and whether it has a row of the page to itself."""
+    """Return the bytes of a PNG, and whether it shows a picture or a plot."""
     if isinstance(content, np.ndarray):
         kind = "picture"
-        broad = content.shape[1] > 2 * len(content)
         data = png(content)
     else:
         kind = "plot"
-        broad = content.get_figwidth() > 6.5  # inches
         buffer = io.BytesIO()
         content.savefig(buffer, format="png", dpi=110, bbox_inches="tight", facecolor="white")
         data = buffer.getvalue()
-    return {"data": data, "base64": base64.b64encode(data).decode(), "kind": kind, "broad": broad}
+    return {"data": data, "base64": base64.b64encode(data).decode(), "kind": kind}
 
 
 def cell(value: object) -> str:

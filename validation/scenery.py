@@ -69,22 +69,9 @@ def _chessboard(count: int) -> Node:
     return _floor({"type": "diffuse", "reflectance": board})
 
 
-def _ball(center: Point, radius: float, bsdf: Node) -> Node:
-    return {"type": "sphere", "center": center, "radius": radius, "bsdf": bsdf}
-
-
 def _lamp(center: Point, radius: float, radiance: float) -> Node:
     emitter = {"type": "area", "radiance": rgb(radiance)}
     return {"type": "sphere", "center": center, "radius": radius, "emitter": emitter}
-
-
-def _spot(intensity: Color) -> Node:
-    place = _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])
-    return {"type": "spot", "intensity": rgb(intensity), "cutoff_angle": 25, "to_world": place}
-
-
-def _sky(color: Color) -> Node:
-    return {"type": "constant", "radiance": rgb(color)}
 
 
 KINDS = ("calm", "texture", "lights", "gloss", "glass", "spot", "fog", "crop")
@@ -113,9 +100,9 @@ def load_room(
         "integrator": {"type": "path"},
         "sensor": sensor([0, 2, 5], [0, 0.6, 0], rfilter, sampler, film=size | (film or {}), **view or {}),
         "floor": _floor(_diffuse(0.5)),
-        "ball": _ball([0, 0.9, 0], 0.8, bsdf or _diffuse(0.5)),
+        "ball": {"type": "sphere", "center": [0, 0.9, 0], "radius": 0.8, "bsdf": bsdf or _diffuse(0.5)},
         "lamp": _lamp([1.5, 4, 1], radius, 4 / radius**2),
-        "sky": _sky(0.05),
+        "sky": {"type": "constant", "radiance": rgb(0.05)},
     }
     return mi.load_dict(nodes | others)
 
@@ -130,6 +117,7 @@ def load_kind(
     height = height or width
     places = np.random.default_rng(1).uniform([-3, 1, -3], [3, 3, 3], (30, 3)).tolist()
     inside = {"type": "ref", "id": "fog"}
+    above = _to().look_at([2, 4, 2], [0, 0, 0], [0, 1, 0])
     window: Node = {"crop_offset_x": width // 4, "crop_offset_y": height // 4}
     window |= {"crop_width": width, "crop_height": height, "sample_border": True}
     window |= {"width": 3 * width // 2, "height": 3 * height // 2, "rfilter": {"type": "gaussian"}}
@@ -142,7 +130,7 @@ def load_kind(
             "bsdf": {"type": "roughplastic", "alpha": 0.1},
         },
         "glass": {"bsdf": {"type": "dielectric"}},
-        "spot": {"lamp": _spot(40)},
+        "spot": {"lamp": {"type": "spot", "intensity": rgb(40), "cutoff_angle": 25, "to_world": above}},
         "fog": {
             "integrator": {"type": "volpath", "max_depth": 5},
             "fog": {"type": "homogeneous", "id": "fog", "sigma_t": 0.15, "albedo": 0.8},

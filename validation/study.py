@@ -28,11 +28,6 @@ class Bound(Measurement):
         mark = "ok" if self.holds else "MISSED"
         return f"{mark:<6} {self.name}: {self.measured:.4g} {self.sign} {self.limit:.4g}"
 
-    def as_dict(self) -> Values:
-        """Return the values of ``summary.json``."""
-        figures = {"measured": self.measured, "limit": self.limit, "sense": self.sign}
-        return {"name": self.name, **figures, "holds": self.holds, "note": self.note}
-
 
 @dataclass
 class Study:
@@ -114,9 +109,14 @@ class Study:
         def plain(value: object) -> object:
             return value.item() if isinstance(value, np.generic) else str(value)
 
+        bounds = [
+            {"name": b.name, "measured": b.measured, "limit": b.limit, "sense": b.sign}
+            | {"holds": b.holds, "note": b.note}
+            for b in self.bounds
+        ]
         found = {
             "title": self.title,
-            "bounds": [bound.as_dict() for bound in self.bounds],
+            "bounds": bounds,
             "tables": self.tables,
             "passed": self.passed,
             "verdict": self.verdict,

@@ -258,12 +258,15 @@ Truth = tuple[Array, Array, float]  # two independent halves, or twice the same 
 
 def _automatic(run: Run, cases: Mapping[str, Options], step: int) -> Truth:
     """Render the scene by its own integrator, with more rays than the cases, doubled ``step`` times."""
-    uniform = {"aamode": "none", "target": None}
-    if run(uniform, 0).options["lattice"] == "film":
-        spp = max(int(case.get("spp") or 16) for case in cases.values())
-        return _rendered(run, {**uniform, "spp": 2 * spp * 2**step})
-    aa = max(int(case.get("aa") or 4) for case in cases.values())
-    return _rendered(run, {**uniform, "lattice": "centered", "aa": 2 * aa * 2**step})
+    options: dict[str, Any] = {"aamode": "none", "target": None}
+    amount = "spp"
+    least = 16
+    if run(options, 0).options["lattice"] != "film":
+        options["lattice"] = "centered"
+        amount = "aa"
+        least = 4
+    most = max(int(case.get(amount) or least) for case in cases.values())
+    return _rendered(run, {**options, amount: 2 * most * 2**step})
 
 
 def _rendered(run: Run, options: Options) -> Truth:

@@ -71,7 +71,7 @@ def measure(number: int, size: tuple[int, int], repeats: int) -> Values:
 
 
 def run(study: Study, *, quick: bool) -> None:
-    """Fill the study; a picture must not depend on what is left out."""
+    """Fill the study."""
     size = (64, 48) if quick else (320, 240)
     show(study, size, (0, 3, 7) if quick else SCENES, 3 if quick else 7)
 
