@@ -6,7 +6,9 @@ import dataclasses
 import math
 import operator
 import os
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 from mrt_mitsuba.adaptive.target import Target, plain
@@ -38,8 +40,9 @@ def integer(low: int, high: int) -> Kind:
     """Return the kind of whole numbers in [low, high]."""
 
     def convert(value: Any) -> int:
-        number = _whole(value)
-        return _only(number, low <= number <= high)
+        if isinstance(value, bool):
+            raise TypeError
+        return _only(operator.index(value), low <= value <= high)
 
     return Kind("N", f"a whole number from {low} to {high}", convert, lambda text: int(plain(text)))
 
@@ -73,16 +76,11 @@ def _only(value: Value, allowed: bool) -> Value:
     return value
 
 
-def _whole(value: Any) -> int:
-    if isinstance(value, bool):
-        raise TypeError
-    return operator.index(value)
-
-
-def _real(value: Any) -> float:
+def _real(value: Any, low: float = -sys.float_info.max, end: float = math.inf) -> float:
+    """Return a number in [low, end), by default a finite one."""
     if isinstance(value, bool | str):
         raise TypeError
-    return float(value)
+    return _only(float(value), low <= value < end)
 
 
 def _real_in(text: str) -> float:
@@ -93,19 +91,9 @@ def _reals_in(text: str) -> tuple[float, ...]:
     return tuple(_real_in(part) for part in text.split(","))
 
 
-def _not_negative(value: Any) -> float:
-    number = _real(value)
-    return _only(number, 0 <= number < math.inf)
-
-
-def _angle(value: Any) -> float:
-    degrees = _real(value)
-    return _only(degrees, 0 < degrees < 180)
-
-
 def _point(value: Any) -> tuple[float, ...]:
     point = tuple(_real(part) for part in value)
-    return _only(point, len(point) == 3 and all(math.isfinite(part) for part in point))
+    return _only(point, len(point) == 3)
 
 
 def _target(value: Any) -> Target | tuple[float, ...]:
@@ -146,8 +134,13 @@ def instance(kind: type, allowed: str) -> Kind:
 
 
 WORDS = {"1": True, "0": False, "yes": True, "no": False, "true": True, "false": False}
-NUMBER = Kind("X", "a finite number, 0 or more", _not_negative, _real_in)
-ANGLE = Kind("DEGREES", "degrees, more than 0 and less than 180", _angle, _real_in)
+NUMBER = Kind("X", "a finite number, 0 or more", partial(_real, low=0), _real_in)
+ANGLE = Kind(
+    "DEGREES",
+    "degrees, more than 0 and less than 180",
+    partial(_real, low=sys.float_info.min, end=180),
+    _real_in,
+)
 VECTOR = Kind("X,Y,Z", "three finite numbers separated by commas", _point, _reals_in)
 TARGET = Kind(
     "X|P%|X,Y,Z",

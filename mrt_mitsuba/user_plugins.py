@@ -24,7 +24,6 @@ from mrt_mitsuba.errors import MrtError, UsageError, one_line
 
 _named: list[str] = []  # modules to load in every variant, by name or absolute path
 _executed: set[tuple[str, str]] = set()  # variant and name of what has been executed
-_watching = False
 
 
 def plugin_names(plugins: Any) -> list[str]:
@@ -53,12 +52,11 @@ def load(plugins: Any) -> None:
     ``plugins``: a path or the name of a module, or several. Raises ``UsageError`` where there is no such file
     or module, and ``MrtError`` for one that fails.
     """
-    global _watching
+    watching = bool(_named or _executed)
     _named.extend(name for name in plugin_names(plugins) if name not in _named)
     import mitsuba as mi
 
-    if not _watching:
-        _watching = True
+    if not watching:
         mi.detail.add_variant_callback(lambda old, new: _load_all(new))
     if mi.variant():
         _load_all(mi.variant())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import platform
 import sys
 import time
@@ -16,6 +17,7 @@ from mrt_mitsuba.command.registry import COMMANDS, command_parser
 from mrt_mitsuba.errors import MrtError, SceneError, UsageError, printable, reason
 from mrt_mitsuba.files.images import read_channels
 from mrt_mitsuba.files.replacing import check_target
+from mrt_mitsuba.options import check, integer
 from mrt_mitsuba.scene.files import require_file
 from mrt_mitsuba.scene.report import NUMBERS, report_scene
 
@@ -53,9 +55,9 @@ def doctor() -> int:
     Return 0 if that passed, else 1.
     """
     print(f"mrt-mitsuba {mrt_mitsuba.__version__}, Python {platform.python_version()}, {platform.platform()}")
-    installed = {each.metadata["Name"].lower(): each.version for each in metadata.distributions()}
     for package in ("mitsuba", "drjit", "numpy", "OpenEXR", "pillow", llvm.WHEEL):
-        print(f"  {package:<20}{installed.get(package.lower(), 'not installed')}")
+        with contextlib.suppress(metadata.PackageNotFoundError):  # the wheel of LLVM may be missing
+            print(f"  {package:<20}{metadata.version(package)}")
     choice = llvm.prepare()
     print(choice.describe())
     start = time.perf_counter()
@@ -116,9 +118,8 @@ def sweep(out: str, file: str, *, workers: str | None = None, **given: Any) -> i
     refused = settings.keys() & {"out", "progress"}
     if refused:
         raise UsageError(f"{file}: {min(refused)} cannot be set in a file")
-    count = int(workers) if workers and workers.isdecimal() else workers
-    if count is not None:
-        settings["workers"] = count
+    if workers is not None:
+        settings["workers"] = check("workers", integer(1, 65535), workers, text=True)
     settings |= given
     grid = dict(_axes(settings.pop("grid", {})))
     scene = settings.pop("scene", None if "scene" in grid else 0)

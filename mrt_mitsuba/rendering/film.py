@@ -14,6 +14,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from mrt_mitsuba.plugins.variants import is_jit
+
 FILTER_STEPS_PER_PIXEL = 32  # of a pixel, where integrals over a filter are summed
 
 
@@ -22,14 +24,13 @@ def opaque(number: float, kind: str | None = None) -> mi.Float:
 
     ``kind``: name of its type in Mitsuba; None: UInt32 for a whole number, else Float.
     """
-    variant = mi.variant()
-    if variant.startswith("scalar"):
+    if not is_jit():
         return number
     if kind is None:
         kind = "UInt32" if isinstance(number, int) else "Float"
     # a kernel that dr.freeze records may read only what is made while it does
     make = _array.__wrapped__ if dr.flag(dr.JitFlag.FreezingScope) else _array
-    return make(variant, kind, number)
+    return make(mi.variant(), kind, number)
 
 
 def divide(n: mi.UInt32, divisor: int) -> tuple[mi.UInt32, mi.UInt32]:
@@ -39,7 +40,7 @@ def divide(n: mi.UInt32, divisor: int) -> tuple[mi.UInt32, mi.UInt32]:
     so vectorised variants multiply by the inverse in double precision. The half added keeps n/d away from
     whole numbers by 1/(2 d), and rounding moves it by less than n/d / 2⁵² < 1/(2 d).
     """
-    if mi.variant().startswith("scalar"):
+    if not is_jit():
         return divmod(n, divisor)
     quotient = mi.UInt32((mi.Float64(n) + 0.5) * opaque(1 / divisor, "Float64"))
     return quotient, n - quotient * opaque(divisor, "UInt32")
@@ -153,7 +154,7 @@ class Film:
         self.rays = int(sampler.sample_count())  #: of a pixel, as the scene's sampler has them
         self.sampler = sampler.class_name()
         #: whether rays get independent random numbers, as they always do in scalar variants
-        self.independent = mi.variant().startswith("scalar") or self.sampler == "IndependentSampler"
+        self.independent = not is_jit() or self.sampler == "IndependentSampler"
 
     def picture(self, sampled: np.ndarray) -> np.ndarray:
         """Return an array [..., rows, columns, channels] without the film's border."""
@@ -184,7 +185,7 @@ class Film:
     def weights(self) -> np.ndarray:
         """Values of the filter along an axis, [pixels in its reach, ``FILTER_STEPS_PER_PIXEL``]."""
         flat = self._offsets.ravel().tolist()
-        if mi.variant().startswith("scalar"):
+        if not is_jit():
             values = [self.rfilter.eval(place) for place in flat]
         else:  # a list is copied; for NumPy's memory, Dr.Jit would compile a kernel for every alignment
             values = self.rfilter.eval(mi.Float(flat))

@@ -14,6 +14,7 @@ from mrt_mitsuba.adaptive.target import Goal
 from mrt_mitsuba.errors import UsageError, needs_extra
 from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.options import either
+from mrt_mitsuba.plugins.variants import is_jit
 from mrt_mitsuba.plugins.whitted import plan as kernel_plan
 from mrt_mitsuba.plugins.whitted.plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rendering.film import Film, SamplePattern
@@ -471,7 +472,7 @@ def _ignored(source: Source, film: Film, on_film: bool, goal: Goal | None) -> It
     if film.bands:
         why = "the picture is the colour of the spectrum that the film sees, and sampling adapts to it"
         yield f"{', '.join(film.bands)} in the picture, only as layers", why
-    if mi.variant().startswith("scalar"):
+    if not is_jit():
         if film.sampler != "IndependentSampler":
             yield film.sampler, "scalar variants draw independent numbers, ray by ray"
     elif goal:

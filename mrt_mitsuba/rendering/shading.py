@@ -15,7 +15,7 @@ from mrt_mitsuba.errors import SceneError
 from mrt_mitsuba.files.layers import FIRST_HIT, TABLE
 from mrt_mitsuba.plugins import classes_of, is_known
 from mrt_mitsuba.plugins.parameters import ParameterError
-from mrt_mitsuba.plugins.variants import text_of
+from mrt_mitsuba.plugins.variants import is_jit, text_of
 from mrt_mitsuba.plugins.whitted.plan import KernelPlan, SceneFacts
 from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.scene.open import Source
@@ -89,7 +89,7 @@ class RayValues:
     def albedo(self) -> mi.Color3f:
         """Diffuse reflectance at the first hit; 0 for a miss."""
         albedo = mi.UnpolarizedSpectrum(0)
-        if not mi.variant().startswith("scalar") or self.found:
+        if is_jit() or self.found:
             bsdf = self.si.bsdf(mi.RayDifferential3f(self.ray))
             albedo = mi.UnpolarizedSpectrum(bsdf.eval_diffuse_reflectance(self.si, self.found))
         return to_rgb(dr.select(self.found, albedo, 0), self.ray)
@@ -188,9 +188,7 @@ class Shader:
         """Displacement of the camera at a time."""
         if self.motion is None:
             return mi.Vector3f(0)
-        if mi.variant().startswith("scalar"):
-            return mi.Vector3f(self.motion) * time
-        return dr.opaque(mi.Vector3f, self.motion) * time
+        return (dr.opaque(mi.Vector3f, self.motion) if is_jit() else mi.Vector3f(self.motion)) * time
 
     def values(self, place: mi.Point2f, time: mi.Float | None, sampler: mi.Sampler) -> RayValues:
         """Trace rays through positions in the picture, [0, 1]², for their values.

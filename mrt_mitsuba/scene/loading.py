@@ -134,14 +134,17 @@ def _check_nodes(nodes: Iterable[mi.parser.SceneNode], inputs: set[str]) -> None
 def _instantiate(state: mi.parser.ParserState, merge: bool, keys: Values) -> mi.Object:
     """Instantiate the objects, after setting properties that the scene gives (``ball.center``); set other
     keys by ``mi.traverse`` (``ball.to_world``)."""
-    unset, stated = _set_properties(state, keys)
+    unset: Values = {}
+    if keys:
+        unset, stated = _set_properties(state, keys)
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False
     config.merge_meshes = merge
     mi.parser.transform_all(config, state)
     with defer_signals():  # an interrupt would leave plugins half made, and later renders would crash
         loaded = mi.parser.instantiate(config, state)
-    set_parameters(loaded, unset, stated)
+    if unset:
+        set_parameters(loaded, unset, stated)
     return loaded
 
 
@@ -171,7 +174,7 @@ def _set_properties(state: mi.parser.ParserState, keys: Values) -> tuple[Values,
     known = {
         f"{place}.{name}": (node.props, name)
         for node, place in zip(state.nodes, places, strict=True)
-        for name in (node.props if place and keys else ())
+        for name in (node.props if place else ())
         if _kind(node.props[name]) in _TYPE_NAMES
     }
     for key in keys.keys() & known.keys():
@@ -186,8 +189,6 @@ def set_parameters(loaded: mi.Object, values: Values, stated: Sequence[str]) -> 
 
     ``stated``: keys of properties, which a message may suggest.
     """
-    if not values:
-        return
     parameters = mi.traverse(loaded)
     for key, value in values.items():
         if key not in parameters:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -54,13 +55,9 @@ def read_mtl(path: StrPath, *, convention: str = "report", folder: Path | None =
     """
     path = Path(path)
     reader = _Reader(path, convention, [folder or path.parent, path.parent])
-    number = 1
-    # a run of empty lines at once
-    for line in re.finditer(rb"[^\n]+|\n+", read_text(path)):
-        if line[0][:1] == b"\n":
-            number += len(line[0])
-        else:
-            reader.read(decode(line[0]).strip(), f"{path}:{number}")
+    for number, line in enumerate(io.BytesIO(read_text(path)), 1):
+        if line != b"\n":
+            reader.read(decode(line).strip(), f"{path}:{number}")
     reader.warn()
     default = DEFAULT_MATERIAL if convention == "report" else _STANDARD
     return {name: replace(default, **fields) for name, fields in reader.blocks.items()}

@@ -107,7 +107,7 @@ class _Reader:
         self.convention = convention
         self.line = 1
         self.values = {kind: [np.empty((0, used), np.float32)] for kind, used in _USED.items()}
-        self.counts = dict.fromkeys(_USED, 0)
+        self.counts = np.zeros(len(_USED), np.int64)  # of the values read so far, by kind
         # Runs of faces with the same number of corners, one on each line: indices from 0, int64 [F, corners,
         # kinds]; the kinds, as in ``_CORNERS``; the material; the first line
         self.faces: list[tuple[np.ndarray, list[int], str, int]] = []
@@ -138,9 +138,8 @@ class _Reader:
         if kind == "f":
             _, kinds = _CORNERS[form[1]]
             index = np.fromstring(words, np.int64, sep=" ").reshape(lines, -1, len(kinds))
-            counts = [*self.counts.values()]
-            backwards = index + [counts[kind] for kind in kinds]
-            faces = np.where(index > 0, index - 1, np.where(index < 0, backwards, -1))
+            backwards = np.where(index < 0, index + self.counts[kinds], -1)
+            faces = np.where(index > 0, index - 1, backwards)
             self.faces.append((faces, kinds, self.material, self.line))
             return
         values = np.fromstring(words, np.float64, sep=" ").reshape(lines, -1)
@@ -154,7 +153,7 @@ class _Reader:
         if large.any():
             self.fail(f"{kind} has a number that is too large for a float32", self.line + large.argmax())
         self.values[kind].append(used)
-        self.counts[kind] += lines
+        self.counts[[*_USED].index(kind)] += lines
 
     def _statement(self, text: bytes) -> None:
         """Read one line of another form."""
@@ -204,7 +203,7 @@ class _Reader:
         values = [np.concatenate(arrays) for arrays in self.values.values()]
         parts: dict[tuple[Material, bool], list[np.ndarray]] = {}
         for faces, kinds, name, line in self.faces:
-            counts = np.array([*self.counts.values()])[kinds]
+            counts = self.counts[kinds]
             for row, corner, k in np.argwhere((faces < 0) | (faces >= counts))[:1]:
                 index = faces[row, corner, k] + 1
                 kind = [*_USED][kinds[k]]

@@ -143,7 +143,7 @@ def jobs(scene: Any, named: Mapping[str, Values], fixed: Values, plugins: Sequen
             RenderSettings.of(**arguments)
         except TypeError as error:
             raise UsageError(str(error)) from None
-        params = {**(fixed.get("params") or {}), **(point.get("params") or {}), **dotted}
+        params = {**(arguments.get("params") or {}), **dotted}
         if params:
             arguments["params"] = {key: plain(value) for key, value in params.items()}
         if id(own) not in scenes:

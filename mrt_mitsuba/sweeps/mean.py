@@ -72,14 +72,11 @@ def _estimate(variance: np.ndarray) -> ErrorEstimate:
 
     The interval is that of a mean of blocks, within which a reconstruction filter correlates pixels.
     """
-    blocks = variance.mean(-1)
-    for axis in (0, 1):
-        steps = np.arange(0, blocks.shape[axis], BLOCK)
-        sizes = np.diff(np.append(steps, blocks.shape[axis]))
-        sums = np.add.reduceat(blocks, steps, axis=axis)
-        blocks = sums / np.expand_dims(sizes, 1 - axis)
+    rows, columns = (math.ceil(count / BLOCK) for count in variance.shape[:2])
+    strips = np.array_split(variance, rows)
+    blocks = [block.mean() for strip in strips for block in np.array_split(strip, columns, axis=1)]
     mean = float(variance.mean())
-    doubt = 1.96 * float(blocks.std()) / math.sqrt(blocks.size)
+    doubt = 1.96 * float(np.std(blocks)) / math.sqrt(len(blocks))
     return ErrorEstimate(
         rmse=math.sqrt(mean), low=math.sqrt(max(mean - doubt, 0.0)), high=math.sqrt(mean + doubt)
     )
