@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 GROWTH = 4.25  # maximum growth of the ray count per round: the error is known better then
 MIN_GROWTH = 1.05  # minimum growth for which another round pays off
 MIN_RAYS = 2**17  # of a picture with a target: fewer do not show what is rare
+ENOUGH = 0.9  # fraction of them that counts as all, as allocations are rounded
 MIN_RELATIVE_DEVIATION = 0.25  # fraction of the mean deviation that each pixel has, until there are MIN_RAYS
 TARGET_MARGIN = 0.97  # fraction of the target aimed for: a forecast is as often too low as too high
 SAFETY = 1.5  # standard errors of the RMSE below the target, so that few pictures exceed it
@@ -140,7 +141,8 @@ def run_rounds(
             target = goal.target.rmse(stats.metric.reference or stats.luminance())
         plain = math.sqrt(float(stats.squared_errors(stats.metric, blurred).mean(-1).mean()))
         denoised = None
-        if denoiser and target and denoiser.pays(spent / pixels, plain, target):
+        enough = spent >= ENOUGH * min(MIN_RAYS, goal.max_spp * pixels)
+        if denoiser and target and enough and denoiser.pays(spent / pixels, plain, target):
             denoised = denoiser.mixture(stats, plain)
         rmse = plain if denoised is None else denoised.rmse
         now = Round(time.perf_counter() - start, spent / pixels, rmse)
@@ -189,7 +191,7 @@ def plan_round(
     if target is None:
         return allocator.allocate(stats, seen, most)
     minimum = min(MIN_RAYS / stats.film.pixels, goal.max_spp)
-    if now.spp < 0.9 * minimum:  # allocations are rounded
+    if now.spp < ENOUGH * minimum:
         return allocator.allocate(stats, seen, min(most, minimum), MIN_RELATIVE_DEVIATION)
     caution = 1 + SAFETY * seen.uncertainty
     if caution * now.rmse <= target:
