@@ -53,6 +53,16 @@ def test_a_target_takes_fewer_rays(calm, metric, target):
     assert found.rounds[-1].rmse == found.error.rmse
 
 
+def test_a_denoised_target_takes_rays_enough_to_show_what_is_rare():
+    """The halves of 8 rays a pixel may agree where both are wrong."""
+    mrt.register()
+    scene = load_kind("gloss", 64)
+    found = [
+        mrt.render(scene, target=0.02, metric="display", denoise=True, seed=seed) for seed in range(505, 509)
+    ]
+    assert min(result.rounds[-1].spp for result in found) > 25
+
+
 def test_what_does_not_pay_is_left_out(calm):
     """Of a chessboard far finer than pixels, a denoiser knows nothing that rays do not say sooner."""
     scene = load_kind("texture", SIZE)
