@@ -131,7 +131,10 @@ def test_parameters_that_are_refused(nested, params, message):
 DOUBLE = "".join(f'<default name="a{i:02}" value="{f"$a{i - 1:02}" * 9 if i else "x"}"/>' for i in range(12))
 
 
-@pytest.mark.parametrize("text", [DOUBLE, '<include filename="in/inner.xml"/>' * 501])
+MANY = f'<default name="a" value="{"x" * 2**20}"/>' + '<default name="b" value="$a"/>' * 17
+
+
+@pytest.mark.parametrize("text", [DOUBLE, MANY, '<include filename="in/inner.xml"/>' * 501])
 def test_files_that_multiply_are_refused(nested, text):
     """Gigabytes from some hundred bytes: of parameters that name each other, of files included many times."""
     nested.write_text(f'<scene version="3.0.0">{text}</scene>')

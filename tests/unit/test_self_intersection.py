@@ -63,6 +63,18 @@ def test_a_grain_on_a_wide_floor_has_its_shadow(variant, kind, place, half):
     assert (dark[0] != dark[1]).sum() < 60
 
 
+@pytest.mark.parametrize("kind", ["rectangle", "mesh"])
+def test_a_small_floor_far_from_the_origin_has_no_dark_spots(variant, kind):
+    """However it is turned, and a lamp lights it from the side."""
+    for k, place in enumerate(np.random.default_rng(5).normal(scale=1000, size=(6, 3)).tolist()):
+        turn = mi.ScalarTransform4f().translate(place).rotate([0.6, 0, 0.8], 50 + 60 * k)
+        eye, lamp = (list(turn @ mi.ScalarPoint3f(*at)) for at in ((1, 0, 1), (2, 0, 0.02)))
+        nodes = {"type": "scene", "integrator": WHITTED, "floor": floor(kind, 4.0, turn)}
+        nodes["sensor"] = sensor(eye, place, (160, 120), up=turn @ mi.ScalarVector3f(0, 1, 0), fov=60)
+        nodes["light"] = {"type": "point", "position": lamp}
+        assert (np.array(mi.render(mi.load_dict(nodes), spp=1)) > 0).all()
+
+
 @pytest.mark.parametrize("size", [1e-9, 1e11])
 def test_meshes_that_rays_cannot_meet_are_refused(variant, size):
     scene = {"type": "scene", "integrator": WHITTED, "sensor": sensor([0, 0, 6 * size], [0, 0, 0], (4, 3))}
