@@ -66,15 +66,16 @@ def choose(environ: Mapping[str, str], search_path: Iterable[str], system: Itera
         (wheel, f"from the package {WHEEL}"),
         (newest, "of the system"),
     )
-    found = [(path, version_of(path), source) for path, source in places]
-    usable = [each for each in found if each[1] and each[1][0] >= OLDEST]
-    path, version, source = usable[0] if usable else (None, None, "none")
     refused = ""
-    if named and path != named:
-        refused = (
-            f"{named}, named by {VARIABLE}, is no file of LLVM {OLDEST} or newer, such as libLLVM.so.19.1"
-        )
-    return Choice(path, version, source, refused)
+    for path, source in places:
+        version = version_of(path)
+        if version and version[0] >= OLDEST:
+            return Choice(path, version, source, refused)
+        if named and path == named:
+            refused = (
+                f"{named}, named by {VARIABLE}, is no file of LLVM {OLDEST} or newer, such as libLLVM.so.19.1"
+            )
+    return Choice(None, None, "none", refused)
 
 
 def wheel_library(search_path: Iterable[str]) -> str:

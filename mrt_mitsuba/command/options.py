@@ -133,10 +133,13 @@ class Parser(argparse.ArgumentParser):
         hint = f"Did you mean {close[0]}?" if close else f"'{self.prog} --help' lists the options."
         raise UsageError(f"unknown option {name!r}. {hint}")
 
-    def read(self, words: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return values by name, and those of unknown names; raise ``UsageError`` for other words."""
+    def read(self, words: Sequence[str]) -> dict[str, Any]:
+        """Return the values of words and options, as text but for "scene", with "params" for an XML file.
+
+        Raises ``UsageError`` for words that are not known, but for names in an XML scene.
+        """
         arguments: list[str] = []
-        others: dict[str, str] = {}
+        params: dict[str, str] = {}
         given: set[str] = set()
         for word in words:
             name, equals, value = word.partition("=")
@@ -150,13 +153,35 @@ class Parser(argparse.ArgumentParser):
             if name in self.forms:
                 arguments.append(f"--{name}={value}")
             else:
-                others[name] = value
+                params[name] = value
         found, rest = self.parse_known_args(arguments)
         if rest and rest[0].startswith("-"):
             self.unknown(rest[0])
         if rest:
             self.error(f"unexpected argument {rest[0]!r}")
-        return vars(found), others
+        values = vars(found)
+        scene = _scene_of(values)
+        if is_path(scene, ".xml"):  # names that it does not use are refused when it is read
+            params |= {name: values.pop(name) for name in ONLY_OBJ & values.keys()}
+        elif params:
+            self.unknown(min(params))
+        return values | ({"params": params} if params else {})
+
+
+def _scene_of(values: dict[str, Any]) -> int | str | None:
+    """Return SCENE or scene=PATH, and put it into the values as "scene"."""
+    scene = values.get("scene")
+    if number := values.pop("number", None):
+        if scene is not None:
+            raise UsageError(f"both SCENE {number} and scene={scene}: give one of them")
+        if number not in SCENES and not is_path(number, (".xml", ".obj")):
+            raise UsageError(
+                f"SCENE {number}: must be {either(SCENES)} ('mrt scenes' lists them); a file is scene=PATH"
+            )
+        scene = number
+    if scene is not None:
+        values["scene"] = int(scene) if scene in SCENES else scene
+    return scene
 
 
 def render_parser() -> Parser:
@@ -165,37 +190,13 @@ def render_parser() -> Parser:
     return Parser("mrt", f"{FORM}\n       mrt COMMAND ...", ABOUT, {}, dict.fromkeys((*first, *TABLE)))
 
 
-def read_scene(parser: Parser, words: Sequence[str]) -> dict[str, Any]:
-    """Return the values of options, as text but for "scene", with "params" for an XML file.
-
-    Raises ``UsageError`` for words that the parser does not know, but for names in an XML scene.
-    """
-    values, params = parser.read(words)
-    scene = values.get("scene")
-    if number := values.pop("number", None):
-        if scene is not None:
-            parser.error(f"both SCENE {number} and scene={scene}: give one of them")
-        if number not in SCENES and not is_path(number, (".xml", ".obj")):
-            raise UsageError(
-                f"SCENE {number}: must be {either(SCENES)} ('mrt scenes' lists them); a file is scene=PATH"
-            )
-        scene = number
-    if scene is not None:
-        values["scene"] = int(scene) if scene in SCENES else scene
-    if is_path(scene, ".xml"):  # names that it does not use are refused when it is read
-        params |= {name: values.pop(name) for name in ONLY_OBJ & values.keys()}
-    elif params:
-        parser.unknown(min(params))
-    return values | ({"params": params} if params else {})
-
-
 def parse(arguments: Sequence[str]) -> Options:
     """Turn ``FILENAME [SCENE] [name=value ...]`` into options; raise ``UsageError`` naming what is wrong."""
-    return checked(_filename(arguments[0]), read_scene(render_parser(), arguments[1:]))
+    return checked(_filename(arguments[0]), render_parser().read(arguments[1:]))
 
 
 def checked(filename: str, given: dict[str, Any]) -> Options:
-    """Return options of the values that ``read_scene`` gives; raise ``UsageError`` for a wrong one."""
+    """Return options of the values that a parser gives; raise ``UsageError`` for a wrong one."""
     values: dict[str, Any] = {"params": given.pop("params", None)}
     for name, text in given.items():
         values[name] = check(name, TABLE[name].metadata["kind"], text, text=isinstance(text, str))

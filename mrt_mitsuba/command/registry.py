@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import NamedTuple
 
-from mrt_mitsuba.command.options import Parser, read_scene
+from mrt_mitsuba.command.options import Parser
 from mrt_mitsuba.scene.model import MODEL_OPTIONS
 
 TOOLS = "mrt_mitsuba.command.tools"
@@ -120,7 +120,7 @@ def run(name: str, words: Sequence[str]) -> int:
     if not HELP.isdisjoint(words):
         sys.stdout.write(parser.format_help())
         return 0
-    values = read_scene(parser, words)
+    values = parser.read(words)
     if "scene" in values:
         import_plugins(values.pop("plugins", ()))
     elif "scene" in command.options:

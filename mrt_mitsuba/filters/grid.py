@@ -101,12 +101,8 @@ class Grid:
 
         ``planes``: one plane of numbers or truth values, or several to be interleaved.
         """
-        flat = planes[0]
-        if len(planes) > 1:
-            flat = dr.empty(self.Float, len(planes) * self.count)
-            for channel, plane in enumerate(planes):
-                dr.scatter(flat, plane, len(planes) * self.index + channel)
-        return np.array(flat).reshape(self.rows, self.columns, *channels)
+        values = np.stack([np.array(plane) for plane in planes], axis=-1)
+        return values.reshape(self.rows, self.columns, *channels)
 
 
 def finite(planes: Sequence[Float]) -> Mask:

@@ -164,13 +164,12 @@ class Passes:
             self.left_out = ("denoising", denoiser.left_out)
         if step.goal.denoise:
             denoised = finished.denoised
+            weight = self._layer("denoised")
             self._layer("noisy")[:] = self._layer("image")
             if denoised is not None:
+                weight[..., 0] = denoised.weight
                 self._layer("image")[:] = denoised.image
-                self._layer("denoised")[..., 0] = denoised.weight
                 self._layer("error")[..., 0] = denoised.error
-            else:
-                self._layer("denoised")[:] = 0
 
     def _features(self) -> tuple[np.ndarray, np.ndarray]:
         """Albedo and shading normals of first hits, averaged over a few rays by the film, [H, W, 3] each."""
