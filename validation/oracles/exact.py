@@ -123,9 +123,7 @@ DISTRIBUTIONS: dict[str, type[Beckmann | GGX]] = {"beckmann": Beckmann, "ggx": G
 class Lobe(NamedTuple):
     """The specular lobe without Fresnel, in exact numbers."""
 
-    tan2: Number  #: tan²θh
     d: Number
-    g: Number  #: of both directions
     value: Number  #: D G / (4 cos θi)
 
 
@@ -136,4 +134,4 @@ def lobe(wi: Sequence[Number], wo: Sequence[Number], alpha: Number, distribution
     microfacets = DISTRIBUTIONS[distribution]
     d = microfacets.d(1 / mp.sqrt(1 + tan2), alpha)
     g = microfacets.g1(wi, alpha) * microfacets.g1(wo, alpha)
-    return Lobe(tan2, d, g, d * g / (4 * number(wi[2])))
+    return Lobe(d, d * g / (4 * number(wi[2])))
