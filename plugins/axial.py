@@ -96,9 +96,8 @@ class AxialMesh(mi.Mesh):
         write_buffers(self, vertex_positions=positions, vertex_normals=normals)
 
     def to_string(self) -> str:
-        points = ", ".join(f"{name}={[*map(first, self.parameters[name])]}" for name in self.ends)
-        radius = first(self.parameters["radius"])
-        return f"{type(self).__name__}[{points}, radius={radius:g}, capped={self.capped}]"
+        parameters = ", ".join(f"{name}={value}" for name, value in self.parameters.items())
+        return f"{type(self).__name__}[{parameters}, capped={self.capped}]"
 
 
 class MrtCone(AxialMesh):

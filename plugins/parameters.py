@@ -106,9 +106,7 @@ def vector(
 
 def transform(props: mi.Properties, name: str) -> np.ndarray:
     """Return the matrix of a transform, float64 [4, 4]; the identity by default."""
-    if name not in props:
-        return np.eye(4)
-    value = props[name]
+    value = props.get(name, mi.ScalarTransform4f())
     if "Transform" not in type(value).__name__:  # it has several classes, and arrays have any attribute
         _fail(props, name, value, "a transform")
     return np.array(value.matrix, np.float64)

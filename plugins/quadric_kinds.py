@@ -199,12 +199,12 @@ class Axial:
         _, by_r, by_z = self.side(radius, z)
         vertices, faces = _bands(segments, z, radius, by_r, by_z)
         for end in self.parts[1:] if self.closed else ():
-            # From the rim to the centre at z = 1, and back at z = 0
-            z, radius, up = (1, [[1], [0]], 1) if end == BASE else (0, [[0], [1]], -1)
-            more, fan = _bands(segments, z, np.array(radius), 0, up)
-            more[:, 6:] = 0.5 + 0.5 * more[:, :2]
+            up = 1 if end == BASE else -1
+            disc, fan = _bands(segments, max(up, 0), np.array([[1], [0]]), 0, up)
+            disc[:, 6:] = 0.5 + 0.5 * disc[:, :2]
+            fan = np.minimum(fan, segments + 1)[:, ::up]  # all around one centre
             faces = np.concatenate([faces, fan + len(vertices)])
-            vertices = np.concatenate([vertices, more])
+            vertices = np.concatenate([vertices, disc[: segments + 2]])
         return vertices, faces
 
 

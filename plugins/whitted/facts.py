@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .. import classes_of, is_known
+from .. import classes_of
 from ..lobes import LOBES
 from ..parameters import ParameterError
 from ..variants import is_jit
@@ -39,13 +39,11 @@ class Reading:
         shapes = snapshot.shape_part
         materials = snapshot.material_part
         lights = snapshot.light_part
-        known = [s for s in snapshot.shapes if is_known(s)]
         planes = classes_of("planes")
         quadrics = classes_of("quadrics")
-        self.planes = [s for s in known if isinstance(s, planes)]
-        self.quadrics = [s for s in known if isinstance(s, quadrics)]
-        analytic = {id(s) for s in (*self.planes, *self.quadrics)}
-        self.native = [s for s in snapshot.shapes if id(s) not in analytic]
+        self.planes = [s for s in snapshot.shapes if type(s) in planes]
+        self.quadrics = [s for s in snapshot.shapes if type(s) in quadrics]
+        self.native = [s for s in snapshot.shapes if type(s) not in (*planes, *quadrics)]
         #: the rows of the materials by shape, none where they have no place in one table
         self.materials, of_materials = cache("material facts", (shapes, materials), _read_materials, snapshot)
         of_shapes = cache("shape facts", shapes, self._read_shapes)

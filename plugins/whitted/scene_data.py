@@ -70,14 +70,16 @@ class SceneData:
         self.environment = now.environment
         self._cache = cache
         self._shape_key = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
-        self.known = now.material_part.known and now.light_part.known
+        self._comparable = now.material_part.comparable and now.light_part.comparable
         traced = cache("traced", self._shape_key, _trace, reading, plan)
         self.bvh = traced.bvh or scene
         self.planes = traced.planes
         self.quadrics = traced.quadrics
         self.errors = traced.errors
         self.spheres = traced.spheres
-        self.lights = cache("lights", (now.light_part, plan.lights), _lights, reading, plan)
+        self.lights = cache(
+            "lights", (now.light_part, plan.lights), Lights, reading.lights, reading.light_rows, plan.lights
+        )
         light_key = now.light_part, plan.light_buffers, *self._shape_key
         self.light_buffers = cache("light buffers", light_key, _light_buffers, reading, plan, traced)
         eye_key = now.eye, plan.eye_buffer, *self._shape_key
@@ -92,7 +94,7 @@ class SceneData:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
         plan = self.plan
         sky = self.environment
-        if not self.known:
+        if not self._comparable:
             return None
         tabulated = plan.merged and (plan.lights == "none" or self.facts.lights_tabulated)
         tabulated = tabulated and (plan.spheres == "table" or not plan.bvh)
@@ -235,10 +237,6 @@ def _trace(reading: Reading, plan: KernelPlan) -> Traced:
 
         quadrics = Quadrics(exact)
     return Traced(bvh, Planes(planes), quadrics, HitErrors(others), spheres)
-
-
-def _lights(reading: Reading, plan: KernelPlan) -> Lights:
-    return Lights(reading.lights, reading.light_rows, plan.lights)
 
 
 def _light_buffers(

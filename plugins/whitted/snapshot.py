@@ -62,7 +62,6 @@ class SnapshotPart:
 
     state: list[object] = field(default_factory=list)  # what is compared
     comparable: bool = True  # equal states mean that nothing has changed
-    known: bool = True  # Mitsuba or this project has the classes of all objects
     differentiated: bool = False  # are derivatives wanted
     _held: dict[int, object] = field(default_factory=dict)  # objects, by id
     _arrays: list[dr.ArrayBase] = field(default_factory=list)
@@ -74,7 +73,7 @@ class SnapshotPart:
             return
         self._held[id(thing)] = thing
         if not (is_known(thing) or isinstance(thing, mi.Shape)):  # all that is read of shapes is in arrays
-            self.known = self.comparable = False
+            self.comparable = False
         if is_jit() and hasattr(thing, "snapshot_state"):  # many are looked at in less time
             plain, things, arrays = thing.snapshot_state()
             self.state += *plain, *map(id, things)
