@@ -14,7 +14,6 @@ from nodes import rgb, sensor
 from numpy.testing import assert_array_equal
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.mitsuba_changes import needs_lock
 from mrt_mitsuba.plugins import plugin
 
 DOORS: dict[str, Callable[[mi.Scene], np.ndarray]] = {
@@ -206,12 +205,6 @@ def test_what_others_wrote_in_python_is_asked_each_time(variant, door, what, whe
         set_level(other, where, number)
         assert_array_equal(changed, DOORS["mrt.render" if door == "prepare" else door](other))
         first = changed
-
-
-def test_a_texture_of_others_is_no_integrator_that_may_wait(variant):
-    sky = {"type": foreign_texture("instance")}
-    around = {"type": "aov", "aovs": "far:depth", "nested": {"type": "mrt_whitted", "sky": sky}}
-    assert needs_lock(mi.load_dict(around))
 
 
 def test_a_class_derived_from_mrt_bsdf_is_called(variant):
