@@ -12,7 +12,7 @@ import numpy as np
 from numpy.linalg import norm
 
 from mrt_mitsuba.plugins import fresnel
-from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene, Sphere
+from mrt_mitsuba.scene.model import Camera, Cone, Cylinder, Light, Material, Plane, Scene
 from mrt_mitsuba.validation import plotting
 from mrt_mitsuba.validation.bsdf_probe import evaluate, pairs_about
 from mrt_mitsuba.validation.oracles import exact
@@ -146,9 +146,7 @@ def index(above: float, count: int) -> Curves:
 # -------------------------------------------- Geometry --------------------------------------------
 
 
-def _hits(
-    thing: Cone | Cylinder | Plane | Sphere, targets: Array, eyes: Array, stock: Values | None = None
-) -> Curves:
+def _hits(thing: Cone | Cylinder | Plane, targets: Array, eyes: Array, stock: Values | None = None) -> Curves:
     """How far hits of rays from eyes to targets [N, 3] are off a surface, in roundings of coordinates.
 
     ``stock``: a shape of Mitsuba's, for what it has no shape of our own for: there it sees our mesh.
@@ -173,15 +171,6 @@ def _hits(
         off = np.where(hit, t, truth) - truth
         errors[name] = np.where(hit, abs(off * dot(normal, d)) / scale / ROUNDING, NONE_RIGHT)
     return errors
-
-
-def ball(far: float, count: int) -> Curves:
-    """Measure hits of a ball of radius 1 at a distance, in its radii."""
-    rng = np.random.default_rng(5)
-    eyes = far * unit(rng.normal(size=(count, 3)))
-    across = unit(np.cross(eyes, rng.normal(size=(count, 3))))
-    targets = across * rng.uniform(0, 0.9, (count, 1))
-    return _hits(Sphere((0, 0, 0), 1.0, MIRROR), targets, eyes, {"type": "sphere"})
 
 
 def floor(far: float, count: int) -> Curves:
@@ -228,5 +217,4 @@ AXES = (
     Axis("hit with a floor", "distance / height of the eye", "rectangle", (0, 6), floor, HIT),
     Axis("hit with a cone", "height / radius", "256-sided mesh", (-4, 4), cone, HIT),
     Axis("hit with a cylinder", "height / radius", "cylinder", (-4, 4), cylinder, HIT),
-    Axis("hit with a ball", "distance / radius", "sphere", (1, 5), ball, HIT),
 )
