@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrt_mitsuba import runtime
-from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.errors import UsageError, printable
 from mrt_mitsuba.files import images
 from mrt_mitsuba.files.layers import AVERAGED
 from mrt_mitsuba.files.layers import TABLE as LAYER_TABLE
@@ -97,6 +97,13 @@ class Result:
             **estimated,
             **{f"mrt:{name}": matrix.tolist() for name, matrix in self.camera.items()},
         }
+
+    def __repr__(self) -> str:
+        height, width = self.image.shape[:2]
+        layers = f", layers {', '.join(self.layers)}" if self.layers else ""
+        error = "" if self.error is None else f", error {self.error}"
+        name = printable(self.plan.scene)
+        return f"<Result of scene {name}: {width}x{height}{layers}{error}, {self.timings.total:.3g} s>"
 
     def _repr_png_(self) -> bytes:
         """Return the picture as a notebook shows it, in sRGB as screens expect it."""

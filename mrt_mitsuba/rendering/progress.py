@@ -98,6 +98,11 @@ class Timings:
     kernels: float = 0.0  #: kernels running
     passes: dict[str, float] = field(default_factory=dict)  #: by the name of the pass
 
+    def __repr__(self) -> str:
+        parts = {"load": self.load, **self.passes, "of these: compile": self.compile, "kernels": self.kernels}
+        named = ", ".join(f"{name} {seconds:.3g}" for name, seconds in parts.items())
+        return f"<Timings: {self.total:.3g} s: {named}>"
+
 
 class Job:
     """A render under way: where it reports, how much it does at once, and what it has cost so far."""

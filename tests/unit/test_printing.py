@@ -1,4 +1,4 @@
-"""Every plugin can be printed, alone and in a scene."""
+"""Every plugin can be printed, alone and in a scene; results are a line."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import mitsuba as mi
 import pytest
 from nodes import example
 
+import mrt_mitsuba as mrt
 from mrt_mitsuba.plugins.table import PLUGINS
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -21,3 +22,12 @@ def test_every_plugin_can_be_printed(variant, row):
     if isinstance(made, mi.BSDF):
         made = mi.load_dict({"type": "sphere", "bsdf": made})
     assert f"{row.class_name}[" in str(mi.load_dict({"type": "scene", "made": made}))
+
+
+def test_results_are_printed_in_a_line_each():
+    result = mrt.render(0, width=8, height=6, target=10)
+    assert repr(result).startswith("<Result of scene 0: 8x6, layers error.Y, ")
+    assert f", error {result.error}, " in repr(result)
+    assert repr(result.timings).startswith(f"<Timings: {result.timings.total:.3g} s: load ")
+    for shown in (result, result.timings, result.error, result.rounds[-1]):
+        assert len(repr(shown).splitlines()) == 1 and len(repr(shown)) < 200
