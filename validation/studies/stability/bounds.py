@@ -26,7 +26,7 @@ IORS = (1 + 1e-7, 1e-3)
 def reflectance(study: Study, *, quick: bool) -> None:
     """Hold F where total reflection begins, and values at extreme roughnesses."""
     # there F ends in a square root: errors are those of g = 0
-    iors = np.repeat(np.float32([0.5, 0.9, 0.99, 0.9999]), 81)
+    iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
     critical = np.sqrt(1 - np.float64(iors) ** 2)
     cosines = np.float32(critical + np.tile(np.arange(-40, 41), 4) * np.spacing(np.float32(critical)))
     why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
