@@ -40,11 +40,6 @@ if TYPE_CHECKING:
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 GREY_WEIGHTS = (0.07, 0.72, 0.21)
-CONTRAST_OFFSET = 0.05  # of luma, as the thresholds: the report's
-ABSOLUTE_THRESHOLD = 0.0312
-RELATIVE_THRESHOLD = 0.125
-CREASE_ANGLE = 20.0  # degrees between the normals of neighbours
-DEPTH_STEP = 0.02  # relative second difference of the inverse distance
 NOISE_SIGMAS = 3.0  # standard deviations that noise explains
 REACH = 1  # rows and columns of neighbours that a pixel depends on, either way
 
@@ -61,13 +56,21 @@ class EdgeMap:
     value: np.ndarray
 
 
-def luma_edges(image: Array, *, variance: Array | None = None) -> EdgeMap:
+def luma_edges(
+    image: Array,
+    *,
+    contrast_offset: float = 0.05,
+    absolute_threshold: float = 0.0312,
+    relative_threshold: float = 0.125,
+    variance: Array | None = None,
+) -> EdgeMap:
     """Find edges by the contrast of luma.
 
     With ``L = √(0.299 R + 0.587 G + 0.114 B)`` and the largest and smallest L of the 3×3 neighbourhood, a
-    pixel's value is ``r = max − min + 0.05``, and it is left alone if ``r < max(0.0312, 0.125 max)``. Every
-    pixel whose neighbourhood stays below L = 0.4 is an edge, flat or not: the offset alone exceeds the
-    threshold. A negative sum counts as 0.
+    pixel's value is ``r = max − min + contrast_offset``, and it is left alone if ``r <
+    max(absolute_threshold, relative_threshold · max)``. With the report's values, the defaults, every pixel
+    whose neighbourhood stays below L = 0.4 is an edge, flat or not: the offset alone exceeds the threshold. A
+    negative sum counts as 0.
 
     With ``variance``, ``max − min`` shrinks by three standard deviations of L at either end, and a
     neighbourhood where nothing remains is left alone, dark ones included. L's variance is ``σ²/(4 Y)``, at
@@ -86,7 +89,8 @@ def luma_edges(image: Array, *, variance: Array | None = None) -> EdgeMap:
     window = _window(grid, luma)
     high = functools.reduce(dr.maximum, window)
     low = functools.reduce(dr.minimum, window)
-    value = high - low + CONTRAST_OFFSET
+    offset = dr.opaque(grid.Float, contrast_offset)
+    value = high - low + offset
     if variance is not None:
         deviation = _deviation(grid, variance, LUMA_WEIGHTS)
         # the last term keeps 0/0 out where the pixel is black and free of noise
@@ -95,18 +99,20 @@ def luma_edges(image: Array, *, variance: Array | None = None) -> EdgeMap:
         noise = dr.sqrt(_sum(_window(grid, luma_variance), [1 / 9] * 9))
         # not above zero where the variance is NaN
         excess = high - low - 2 * NOISE_SIGMAS * noise
-        value = dr.select(excess > 0, excess + CONTRAST_OFFSET, 0)
+        value = dr.select(excess > 0, excess + offset, 0)
     value = dr.select(dr.isfinite(high), value, math.inf)
-    below = value < dr.maximum(ABSOLUTE_THRESHOLD, RELATIVE_THRESHOLD * high)
+    absolute = dr.opaque(grid.Float, absolute_threshold)
+    relative = dr.opaque(grid.Float, relative_threshold) * high
+    below = value < dr.maximum(absolute, relative)
     return _edge_map(grid, ~below, value)
 
 
-def sobel_edges(image: Array, *, variance: Array | None = None) -> EdgeMap:
+def sobel_edges(image: Array, *, threshold: float = 0.0, variance: Array | None = None) -> EdgeMap:
     """Find edges by the Sobel gradient of an integer grey.
 
     ``grey = int(255 (0.07 R + 0.72 G + 0.21 B))``, truncated towards zero as in C, also outside 0..255. A
-    pixel's value is ``|Gx| + |Gy|`` with the 3×3 Sobel kernels, and it is an edge if that is not 0. Sums are
-    exact for grey below 2²¹, a brightness of about 8000.
+    pixel's value is ``|Gx| + |Gy|`` with the 3×3 Sobel kernels, and it is an edge if that exceeds
+    ``threshold``. Sums are exact for grey below 2²¹, a brightness of about 8000.
 
     With ``variance``, grey is not truncated, since noise makes truncation flicker; the value is the whole
     part of what ``|Gx| + |Gy|`` exceeds three standard deviations by. A difference of one grey
@@ -136,24 +142,28 @@ def sobel_edges(image: Array, *, variance: Array | None = None) -> EdgeMap:
         excess = value - NOISE_SIGMAS * noise
         value = dr.select(excess > 0, dr.trunc(excess), 0)
     value = dr.select(finite(w), value, math.inf)
-    return _edge_map(grid, value > 0, value)
+    return _edge_map(grid, value > dr.opaque(grid.Float, threshold), value)
 
 
-def geometry_edges(normal: Array, depth: Array) -> EdgeMap:
+def geometry_edges(
+    normal: Array, depth: Array, *, crease_angle: float = 20.0, depth_step: float = 0.02
+) -> EdgeMap:
     """Find outlines and creases from the first hits.
 
     A pixel's value is the larger of two measures, each in units of its threshold; it is an edge above 1.
 
-    * Crease: ``(1 − n·n') / (1 − cos 20°)``, the largest over the eight neighbours that hit
+    * Crease: ``(1 − n·n') / (1 − cos crease_angle)``, the largest over the eight neighbours that hit
       something.
     * Step: the second difference of the inverse distance, ``|1/a + 1/b − 2/t|``, over the largest of the
-      three inverse distances and 0.02; the largest over the four pairs a, b of opposite neighbours.
+      three inverse distances and ``depth_step``; the largest over the four pairs a, b of opposite neighbours.
       Inverse distance grows linearly over a flat surface in perspective, so a floor is no edge however
       steeply it is seen. A miss has the inverse distance 0, so a hit next to a miss is always an edge.
 
     Args:
         normal: [H, W, 3], unit normals in any fixed frame; ignored at a miss.
         depth: [H, W], distances along the ray; infinity, zero or negative for a miss; NaN is not finite.
+        crease_angle: degrees, above 0 and at most 180.
+        depth_step: relative, above 0.
 
     Raises:
         UsageError: for a wrong shape.
@@ -181,8 +191,8 @@ def geometry_edges(normal: Array, depth: Array) -> EdgeMap:
         dot = sum(window[4] * window[k] for window in windows)
         both = (centre > 0) & (near[k] > 0)
         crease = dr.maximum(crease, dr.select(both, 1 - dot, 0))
-    step /= dr.opaque(grid.Float, DEPTH_STEP)
-    crease /= dr.opaque(grid.Float, 1 - math.cos(math.radians(CREASE_ANGLE)))
+    step /= dr.opaque(grid.Float, depth_step)
+    crease /= dr.opaque(grid.Float, 1 - math.cos(math.radians(crease_angle)))
     value = dr.select(finite(near), dr.maximum(step, crease), math.inf)
     return _edge_map(grid, value > 1, value)
 

@@ -106,18 +106,20 @@ def tilted(degrees: float) -> tuple[float, float, float]:
 
 
 geometry = Cases()
-geometry({"normal": tilted(19.9)}, False)
-geometry({"normal": tilted(20.1)}, True)
+geometry({"normal": tilted(19.9)}, {}, False)
+geometry({"normal": tilted(20.1)}, {}, True)
+geometry({"normal": tilted(20.1)}, {"crease_angle": 30}, False)
 # inverse distances 1/3 and (1 − step)/3, relative to the largest
-geometry({"depth": 3 / (1 - 0.019)}, False)
-geometry({"depth": 3 / (1 - 0.021)}, True)
+geometry({"depth": 3 / (1 - 0.019)}, {}, False)
+geometry({"depth": 3 / (1 - 0.021)}, {}, True)
+geometry({"depth": 3 / (1 - 0.021)}, {"depth_step": 0.03}, False)
 for miss in (np.inf, 0.0, -1.0):
-    geometry({"depth": miss, "normal": np.nan}, True)
+    geometry({"depth": miss, "normal": np.nan}, {}, True)
 
 
-@pytest.mark.parametrize(("change", "is_edge"), geometry)
-def test_geometry_decides_by_angle_step_and_miss(change, is_edge):
-    edges = geometry_edges(*face(slice(4, None), **change))
+@pytest.mark.parametrize(("change", "options", "is_edge"), geometry)
+def test_geometry_decides_by_angle_step_and_miss(change, options, is_edge):
+    edges = geometry_edges(*face(slice(4, None), **change), **options)
     assert edges.mask[2].tolist() == [False] * 3 + [is_edge] * 2 + [False] * 3
     assert np.isfinite(edges.value).all()
 
