@@ -1,4 +1,4 @@
-"""Adaptive sampling at the edges of what can be asked: sizes, amounts, distances, noise, progress."""
+"""Adaptive sampling at the edges of what can be asked: sizes, amounts, noise, progress."""
 
 from __future__ import annotations
 
@@ -54,20 +54,6 @@ def test_any_amount_refines_to_full_supersampling(aa, lattice):
     assert_array_equal(adaptive.image[~refined], one[~refined])
     # the same up to 64 values summed in another order
     assert_allclose(adaptive.image[refined], full.image[refined], atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("distance", "reach"), [(0.0, 1.0), (1e-3, 0.0), (2.0, 0.0), (2.0, 2.0), (1e4, 3.0), (3.0, 1e6)]
-)
-def test_any_focus_is_the_filter_over_the_sharp_picture(distance, reach):
-    options = {"width": 45, "height": 31, "aa": 2, "aamode": "luma"}
-    sharp = mrt.render(3, **options, focaldist=0, layers=["depth"])
-    expected = mrt.filters.gaussian_dof(
-        sharp.image, sharp.layers["depth.Z"], focal_distance=distance, focal_range=reach
-    )
-    found = mrt.render(3, **options, focaldist=distance, focalrange=reach).image
-    # with and without depth, two kernels: single roundings
-    assert_allclose(found, expected, atol=2e-6)
 
 
 class _Recorded(Progress):

@@ -55,8 +55,7 @@ def _rmse(image: np.ndarray, truth: Any) -> float:
 def test_a_target_takes_as_many_rays_as_independent_noise_needs(share):
     """In a picture so large that its first eight rays a pixel are enough to judge by.
 
-    Targets are aimed at 5 % lower, and 30,000 squares tell an RMSE to half a percent. A variance of two rays
-    that is divided by two, not by one, asks for two thirds more rays, and gets to 0.74 of the target.
+    Targets are aimed at 5 % lower, and 30,000 squares tell an RMSE to half a percent.
     """
     target = share * math.sqrt(1 / 12 / 4)  # half of the rays of each half picture's mean
     result = mrt.render(camera(208, 152), integrator=noise(), target=target, seed=1)
