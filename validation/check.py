@@ -16,10 +16,9 @@ from mrt_mitsuba.options import StrPath
 from mrt_mitsuba.rendering.progress import Progress
 from mrt_mitsuba.validation import laws
 from mrt_mitsuba.validation.laws.case import PREAMBLES
-from mrt_mitsuba.validation.laws.examine import TIMEOUT
 from mrt_mitsuba.validation.page import prepare_folder
 
-PREAMBLES["mrt_mitsuba"] = ("import mrt_mitsuba as mrt  # before mitsuba", "mrt.register()")
+PREAMBLES["mrt_mitsuba"] = "import mrt_mitsuba as mrt  # before mitsuba\n\nmrt.register()"
 
 
 @contextmanager
@@ -60,17 +59,15 @@ def check_bsdf(
     quick: bool = False,
     seed: int = 0,
     only: Iterable[str] | None = None,
-    timeout: float = TIMEOUT,
 ) -> Check:
     """Check the laws of a BSDF in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
-    ``quick``: fewer angles and samples. ``only``: names of laws. ``timeout``: seconds after which a law fails
-    that is not done. A loaded BSDF skips what has to load it again. Raises ``UsageError`` for anything else,
-    and ``SceneError`` for a dict that Mitsuba cannot load.
+    ``quick``: fewer angles and samples. ``only``: names of laws. A loaded BSDF skips what has to load it
+    again. Raises ``UsageError`` for anything else, and ``SceneError`` for a dict that Mitsuba cannot load.
     """
     runtime.use()
     with _with_our_errors():
-        return Check(**vars(laws.check_bsdf(bsdf, quick=quick, seed=seed, only=only, timeout=timeout)))
+        return Check(**vars(laws.check_bsdf(bsdf, quick=quick, seed=seed, only=only)))
 
 
 def check_shape(
@@ -79,7 +76,6 @@ def check_shape(
     quick: bool = False,
     seed: int = 0,
     only: Iterable[str] | None = None,
-    timeout: float = TIMEOUT,
 ) -> Check:
     """Check the laws of a shape; see ``check_bsdf``.
 
@@ -87,7 +83,7 @@ def check_shape(
     """
     runtime.use()
     with _with_our_errors():
-        return Check(**vars(laws.check_shape(shape, quick=quick, seed=seed, only=only, timeout=timeout)))
+        return Check(**vars(laws.check_shape(shape, quick=quick, seed=seed, only=only)))
 
 
 def check_emitter(
@@ -97,7 +93,6 @@ def check_emitter(
     quick: bool = False,
     seed: int = 0,
     only: Iterable[str] | None = None,
-    timeout: float = TIMEOUT,
 ) -> Check:
     """Check the laws of an emitter; see ``check_bsdf``. A dict may also be of a shape with an emitter.
 
@@ -106,7 +101,7 @@ def check_emitter(
     """
     runtime.use()
     with _with_our_errors():
-        found = laws.check_emitter(emitter, scene=scene, quick=quick, seed=seed, only=only, timeout=timeout)
+        found = laws.check_emitter(emitter, scene=scene, quick=quick, seed=seed, only=only)
     return Check(**vars(found))
 
 

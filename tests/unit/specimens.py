@@ -371,7 +371,7 @@ def beyond_a_table_of_light(weight, u, ds):
 
 MISTAKES: dict[str, Mistake] = {
     "BSDF: cancelling half vector": bsdf_with("roundoff.lost", GLOSS, value=cancelling),
-    "BSDF: NaN at the least roughness": bsdf_with("finite.values", GLOSS, value=no_number_in_sharp_lobes),
+    "BSDF: NaN at the least roughness": bsdf_with("finite.results", GLOSS, value=no_number_in_sharp_lobes),
     "BSDF: index that is no number": bsdf_with("finite.reads", value=by_an_index_that_is_no_number),
     "BSDF: derivatives that are NaN": bsdf_with("gradients.values gradients.broken", GLOSS, value=steep),
     # whatever types of lobes are asked for

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from . import bsdf_components, bsdf_gradients, bsdf_samples, bsdf_values
 from .bsdf_case import BsdfCase
 from .case import Given
-from .examine import TIMEOUT, examine
+from .examine import examine
 from .law import by_name
 from .page import Check
 
@@ -36,12 +36,10 @@ def check_bsdf(
     quick: bool = False,
     seed: int = 0,
     only: Iterable[str] | None = None,
-    timeout: float = TIMEOUT,
 ) -> Check:
     """Check the laws of a BSDF in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
-    ``quick``: fewer angles and samples. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law
-    fails that is not done. A loaded BSDF skips what has to load it again. Raises ``UsageError`` for anything
-    else, and ``LoadError`` for a dict that Mitsuba cannot load.
+    ``quick``: fewer angles and samples. ``only``: names of ``LAWS``. A loaded BSDF skips what has to load it
+    again. Raises ``UsageError`` for anything else, and ``LoadError`` for a dict that Mitsuba cannot load.
     """
-    return examine(BsdfCase, bsdf, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
+    return examine(BsdfCase, bsdf, LAWS, quick=quick, seed=seed, only=only)

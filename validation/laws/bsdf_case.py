@@ -92,8 +92,7 @@ class BsdfCase(Case, Probe):
         usable = s.wo.any(axis=1) & ~s.delta & s.lit
         usable &= (self.rng.random(count) < 0.75) & ~narrow(s)
         wo = unit(np.where(usable[:, None], s.wo, self.units(count)))
-        eta = _indices(s.wi, wo, np.where(usable, s.eta, np.nan))
-        pairs = Lanes(wi=s.wi, wo=wo, uv=s.uv, eta=eta)
+        pairs = Lanes(wi=s.wi, wo=wo, uv=s.uv, eta=_indices(s, wo))
         pairs.value, pairs.pdf = self.both(pairs)
         off = self.spread(lambda moved: np.column_stack(self.both(moved)), pairs)
         return pairs.having(value_off=off[:, :-1], pdf_off=off[:, -1])
@@ -115,14 +114,14 @@ def pair_errors(pairs: Lanes, value: Array, pdf: Array) -> Array:
     return np.maximum(excess(value, pairs.value, pairs.value_off), excess(pdf, pairs.pdf, pairs.pdf_off))
 
 
-def _indices(wi: Array, wo: Array, eta: Array) -> Array:
-    """Indices of refraction [N] at ``wo`` over those at ``wi``; where ``eta`` is NaN, the usual one."""
-    crosses = wi[:, 2] * wo[:, 2] < 0
-    unknown = np.isnan(eta)
-    for side in (wi[:, 2] > 0, wi[:, 2] < 0):
-        known = eta[side & crosses & np.isfinite(eta)]
-        eta[side & crosses & unknown] = np.median(known) if len(known) else 1
-    return np.where(crosses, eta, 1)
+def _indices(s: Lanes, wo: Array) -> Array:
+    """Indices of refraction [N] at directions ``wo`` over those at ``wi``, by what samples state."""
+    passed = s.lit & ~s.delta & (s.wi[:, 2] * s.wo[:, 2] < 0) & np.isfinite(s.eta)
+    eta = np.ones(len(wo))
+    for side in (s.wi[:, 2] > 0, s.wi[:, 2] < 0):
+        if (passed & side).any():
+            eta[side & (s.wi[:, 2] * wo[:, 2] < 0)] = np.median(s.eta[passed & side])
+    return eta
 
 
 def live(s: Lanes, value: Array, pdf: Array) -> Array:

@@ -24,9 +24,9 @@ from .faults import (
     smaller,
 )
 from .law import (
-    MIN_QUANTILE_ERRORS,
     SIGMAS,
     Outcome,
+    difference,
     finds,
     measures,
     most,
@@ -38,7 +38,6 @@ from .law import (
 from .probe import BEYOND, Array, Function, Lanes, context, excess, is_scalar, unit
 from .sphere import (
     MAX_LEVEL,
-    POINTS_PER_CELL,
     SMALL_CELL_LEVEL,
     Cells,
     chi_square,
@@ -53,7 +52,6 @@ NUDGED = """for moved in np.eye(3) * 2.0**-18 * np.where(np.array(u) < 0.5, 1, -
     print("random numbers moved by", moved, "direction:", bsdf.sample(ctx, si, a, mi.Point2f(b, c))[0].wo)
 """
 G1_FIT_ERROR = 5e-3  # rational fits of Smith's G₁ are off by up to 0.35 %, and densities with them
-MAX_UNRESOLVED_SHARE = 0.02  # of samples in cells that quadrature does not resolve; usually 0.001
 UNRESOLVED = "neither float32 directions nor the samples resolve the lobe"
 MAX_BROAD_DENSITY = 20.0  # a density per steradian: lobes are then wide against a degree
 NUDGE = 2.0**-18  # of a random number: a hundred roundings of the direction
@@ -141,26 +139,30 @@ def sampling(law: Outcome, case: BsdfCase) -> None:
     wi, wo = unit(rng.normal(size=(2, count, 3)))
     anywhere = Lanes(wi=wi, wo=wo, uv=rng.random((count, 2), np.float32))
     law.check("dark", probe.without_density(*case.both(anywhere)), anywhere)
+    if is_scalar():
+        law.notes.append("too few samples to compare with densities: check it in a vectorised variant")
+        return
     judged = []  # indices of views
     tests = []  # [angles, 6, 2]
     worst = []
     beyond = []
     shown = []
     for i, view in enumerate(case.views):
-        pilots, others = np.split(np.arange(len(view.wo)), [len(view.wo) // 4])
-        counted = others[view.density[others] > 0]
-        cells = _cells(case, view, pilots[view.density[pilots] > 0], counted, len(others))
+        first = len(view.wo) // 4  # are pilots, which make the cells
+        count = len(view.wo) - first
+        codes = encode(view.wo[first:][view.density[first:] > 0])
+        cells = _cells(case, view, view.wo[:first][view.density[:first] > 0])
         if cells is None:
             continue
-        codes = encode(view.wo[counted])
-        test, cell = chi_square(cells, codes, len(others), 0.5 * G1_FIT_ERROR)
+        cells = integrate(_density_at(case, view), cells, case.rng, codes, count)
+        test, cell = chi_square(cells, codes, count, 0.5 * G1_FIT_ERROR)
         judged.append(i)
         tests.append(test)
         worst.append(cell)
-        share = len(codes) / len(others)
-        variance = share * (1 - share) / len(others) + cells.variance.sum()
+        share = len(codes) / count
+        variance = share * (1 - share) / count + cells.variance.sum()
         beyond.append(abs(share - cells.mean.sum()) - SIGMAS * np.sqrt(variance))
-        shown.append((cells, cells.counts(codes) / len(others)))
+        shown.append((cells, cells.counts(codes) / count))
     if not judged:
         law.notes.append(f"{UNRESOLVED} at every angle")
         return
@@ -172,7 +174,7 @@ def sampling(law: Outcome, case: BsdfCase) -> None:
     law.check("cells", chance, at[i], cell=worst[i], angles=len(judged))
     law.check("integral", np.maximum(beyond, 0), at)
     broad = [view for view in case.views if 0 < view.density.max() < MAX_BROAD_DENSITY]
-    if broad and not case.quick and not is_scalar():
+    if broad and not case.quick:
         _in_small_cells(law, case, broad)
     if not law.holds:
         angle = float(np.degrees(np.arccos(at.wi[i, 2])))
@@ -182,32 +184,21 @@ def sampling(law: Outcome, case: BsdfCase) -> None:
         law.notes.append(f"{UNRESOLVED} at {len(case.views) - len(judged)} angles, which are left out")
 
 
-def _cells(case: BsdfCase, view: Lanes, pilots: Array, counted: Array, count: int) -> Cells | None:
-    """Cells that resolve the density of a view, with its integrals; None where none do.
-
-    Those of the samples whose indices are ``pilots`` make the cells; ``counted``, of ``count``, are judged.
-    """
-    pilot = view.wo[pilots]
-    codes = encode(view.wo[counted])
+def _cells(case: BsdfCase, view: Lanes, pilot: Array) -> Cells | None:
+    """Cells that hold few of the sampled directions ``pilot`` [P, 3] each; None where none are so small."""
     # around the mirror direction at all scales, where lobes may be that are not sampled
     scales = 10 ** case.rng.uniform(-4, 0, (600, 1))
     mirrored = view.wi[0] * [-1, -1, 1] + scales * case.rng.normal(size=(600, 3))
     seeds = encode(np.concatenate([pilot, unit(mirrored)]))
     most = max(len(view.wo) // 4000, 8)
-    cells = Cells.around(seeds, most, coarsest=3 if is_scalar() else 4)
+    cells = Cells.around(seeds, most)
     crowd = cells.counts(encode(pilot))
     crowded = (crowd * ((cells.level == MAX_LEVEL) & (crowd > 4 * most))).sum()
     # at the normal, all azimuths of the finest cells are one place
     centre = (np.hypot(*pilot.T[:2]) < np.sqrt(2) * 0.5**MAX_LEVEL).sum()
     if max(crowded, centre) > 0.01 * len(pilot):  # samples are closer together than the finest cells
         return None
-    integrals = integrate(_density_at(case, view), cells, case.rng, codes, count)
-    # samples in cells where fewer than two of the cell's points are expected within the lobe
-    covered = integrals.counts(codes, 1 / (count * view.density[counted]))
-    coarse = covered * POINTS_PER_CELL < 2 * integrals.solid_angle
-    overlooked = integrals.counts(codes)[coarse].sum()
-    known = integrals.mean.sum() * count > len(codes) or overlooked < MAX_UNRESOLVED_SHARE * count
-    return integrals if known else None
+    return cells
 
 
 def _density_at(case: BsdfCase, view: Lanes) -> Function:
@@ -229,7 +220,7 @@ def _nudged(law: Outcome, case: BsdfCase) -> None:
         wo = case.sample(drawn.having(u=moved)).wo
         changes += (wo != drawn.wo).any(axis=1)
     smooth = drawn.lit & ~drawn.delta & (drawn.pdf < MAX_BROAD_DENSITY) & drawn.wo.any(axis=1)
-    if smooth.sum() >= MIN_QUANTILE_ERRORS:
+    if smooth.mean() > 0.1:  # else few are broad enough, at the foot of a lobe
         law.check("still", (changes < 2)[smooth], drawn[smooth])
 
 
@@ -334,23 +325,15 @@ def energy(law: Outcome, case: BsdfCase) -> None:
     apart = []
     for i in range(len(angles)):
         s = case.sample(at[i].having(u=case.uniform(count, 3)), mode)
-        mean, error = _mean(s.weight)
-        means.append((mean, error))
+        weight = probe.finite_or_0(s.weight).astype(np.float64)
+        means.append([weight.mean(axis=0), weight.std(axis=0) / np.sqrt(count)])
         value, pdf = case.both(s, mode)
         known = s.lit & ~s.delta & (pdf > 0) & np.isfinite(value).all(axis=1)
-        ratio = value / np.where(known, pdf, 1)[:, None]
-        difference, error = _mean(np.where(known[:, None], ratio - s.weight, 0))
-        beyond = np.maximum(abs(difference) - SIGMAS * error, 0)
-        apart.append((beyond / np.maximum(mean, 1e-3)).max())
+        ratio = value.sum(axis=1) / np.where(known, pdf, 1)
+        apart.append(difference(np.where(known, ratio, 0), np.where(known, weight.sum(axis=1), 0)))
     surely = [(mean - SIGMAS * error).max() for mean, error in means]
     law.check("largest", surely, at)
     law.check("apart", apart, at)
     if not law.holds:
         albedos, errors = np.max(means, axis=2).T
         law.plot = partial(plots.albedo, angles, albedos, errors)
-
-
-def _mean(weight: Array) -> tuple[Array, Array]:
-    """The mean of finite weights [N, channels], and its standard error."""
-    weight = probe.finite_or_0(weight).astype(np.float64)
-    return weight.mean(axis=0), weight.std(axis=0) / np.sqrt(len(weight))

@@ -163,13 +163,12 @@ def reciprocity(law: Outcome, case: BsdfCase) -> None:
         return case.eval(at, context(importance=True)) / abs(at.wo[:, 2:])
 
     value = forth(pairs)
-    swapped = back(pairs)
     allowed = case.spread(forth, pairs)
-    for name, other, expected in (("swapped", back, swapped), ("modes", importance, importance(pairs))):
-        error = excess(value, expected, allowed + case.spread(other, pairs))
-        law.check(name, error, pairs)
+    for name, other in (("swapped", back), ("modes", importance)):
+        law.check(name, excess(value, other(pairs), allowed + case.spread(other, pairs)), pairs)
     if not law.holds:
-        law.plot = partial(plots.swapped, value[:3000].max(axis=1), swapped[:3000].max(axis=1))
+        few = pairs[:3000]
+        law.plot = partial(plots.swapped, forth(few).max(axis=1), back(few).max(axis=1))
     _delta_either_way(law, case)
     # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
     s = case.drawn
@@ -212,8 +211,6 @@ def _delta_either_way(law: Outcome, case: BsdfCase) -> None:
 COSINES = (1, 1 - 6e-8, 0.5, 1e-2, 1e-4, 1e-7, 0)
 AZIMUTHS = (0, np.pi / 2, np.pi, -np.pi / 2, 0.7, 4)
 INDICES = ("eta", "k", "int_ior", "ext_ior")
-WRONG = "results not finite, or negative{with_setting}: {faults}"
-SPOILS = "one such number spoils a picture"
 
 
 def no_number_at_the_end(size, weight, u):
@@ -228,14 +225,18 @@ def negative_next_to_normal(size, value, ctx, wi, wo):
     return dr.select(dr.minimum(wi.z, wo.z) > 1 - size, -1, 1) * value
 
 
-@finds("samples", "NaN for the last random numbers, this share", 1e-6, sample=of_weight(no_number_at_the_end))
-@finds("samples", "NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=of_weight(no_number))
-@finds("samples", "direction NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=no_direction)
-@finds("values", "negative value where both cosines are so near to 1", 1e-6, value=negative_next_to_normal)
+@finds("results", "NaN for the last random numbers, this share", 1e-6, sample=of_weight(no_number_at_the_end))
+@finds("results", "NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=of_weight(no_number))
+@finds("results", "direction NaN for a share of the random numbers", 1e-6, quick=4e-6, sample=no_direction)
+@finds("results", "negative value where both cosines are so near to 1", 1e-6, value=negative_next_to_normal)
 @measures(
     reads=most(READS, 0, READS_WHY),
-    values=number_of(WRONG, 0, SPOILS, VALUE),
-    samples=number_of(WRONG, 0, SPOILS, SAMPLE),
+    results=number_of(
+        "results not finite, or negative{with_setting}: {faults}",
+        0,
+        "one such number spoils a picture",
+        VALUE + SAMPLE,
+    ),
 )
 def finite(law: Outcome, case: BsdfCase) -> None:
     """No NaN, infinity or negative number, for extreme directions, random numbers and parameters."""
@@ -262,9 +263,7 @@ def _extremes(case: BsdfCase) -> Lanes:
     kinds = [elsewhere, mirrored, -wi, wi]
     wo = np.choose(rng.integers(len(kinds), size=count)[:, None], kinds)
     u = case.numbers(count, 3, extreme=0.6)
-    corner = rng.random((count, 2)) < 0.3
-    uv = np.where(corner, rng.integers(0, 2, (count, 2)), rng.random((count, 2)))
-    return Lanes(wi=wi, wo=wo, u=u, uv=np.float32(uv))
+    return Lanes(wi=wi, wo=wo, u=u, uv=case.numbers(count, 2, extreme=0.3))
 
 
 def _ends(key: str, number: float) -> tuple[float, float]:
@@ -276,28 +275,23 @@ def _ends(key: str, number: float) -> tuple[float, float]:
 
 
 def _finite(law: Outcome, case: BsdfCase, at: Lanes, setting: tuple[str, float] | None = None) -> bool:
-    """Check values, or samples where values have no fault; return whether all is sound."""
+    """Check values and samples; return whether all is sound."""
     value, pdf = case.both(at)
     s = case.sample(at)
     length = np.linalg.norm(np.float64(s.wo), axis=1)
-    values = {
+    kinds = {
         "eval()": _bad(value),
         "pdf()": _bad(pdf),
         "eval_pdf()": np.any([_bad(values) for values in case.pair(at)], axis=0),
-    }
-    samples = {
         "weights of samples": _bad(s.weight),
         "densities of samples": s.lit & _bad(s.pdf),  # where the weight is 0, nothing more is read
         "directions of samples": s.lit & ~(abs(length - 1) < 1e-3),
     }
-    wrong_values = np.any([*values.values()])
-    kinds = values if wrong_values else samples
     words = ", ".join(f"{kind} {faults.sum()}" for kind, faults in kinds.items() if faults.any())
     if words or not law.parts:
         with_setting = f" with {setting[0]} = {setting[1]:g}" if setting else ""
-        name = "values" if wrong_values else "samples"
         faults = np.any([*kinds.values()], axis=0)
-        law.check(name, faults, at, setting=setting, with_setting=with_setting, faults=words or "none")
+        law.check("results", faults, at, setting=setting, with_setting=with_setting, faults=words or "none")
     return not words
 
 

@@ -23,8 +23,7 @@ Result = TypeVar("Result")
 SCALAR_SHARE = 1 / 64  # of the lanes that a vectorised variant gets: others call once for each
 ENDS = (0, 2.0**-24, 0.5, 1 - 2.0**-24)  # of random numbers, and the middle
 WAVE = 2**20  # lanes that are checked at a time for results that are not finite
-# By package, lines of a program that register its plugins: the first before Mitsuba is imported
-PREAMBLES: dict[str, tuple[str, str]] = {}
+PREAMBLES: dict[str, str] = {}  # by package, what registers its plugins, before Mitsuba is imported
 
 
 @dataclass(frozen=True, repr=False)
@@ -127,18 +126,14 @@ class Case:
         objects = [self.plugin]
         with suppress(Exception):  # a traverse() of a plugin in Python may raise
             objects += mi.traverse(self.plugin).hierarchy
-        first = set()
-        later = set()
-        for module in {type(x).__module__ for x in objects}:
-            package = module.split(".")[0]
-            if package in PREAMBLES:
-                first.add(PREAMBLES[package][0])
-                later.add(PREAMBLES[package][1])
-            elif module == "__main__":
-                later.add("# register your plugin here")
-            elif package not in ("builtins", "mitsuba", "drjit"):
-                later.add(f"import {module}  # registers its plugins")
-        return sorted(first), sorted(later)
+        modules = {type(x).__module__ for x in objects}
+        first = {PREAMBLES[name] for name in PREAMBLES if any(m.startswith(f"{name}.") for m in modules)}
+        known = ("builtins", "mitsuba", "drjit", *PREAMBLES)
+        others = sorted(module for module in modules if module.split(".")[0] not in known)
+        later = [f"import {module}  # registers its plugins" for module in others if module != "__main__"]
+        if "__main__" in others:
+            later.append("# register your plugin here")
+        return sorted(first), later
 
     def _loading(self) -> str:
         """The part of a program that defines ``load`` and loads the plugin."""

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import io
-import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -18,12 +16,6 @@ from .case import Case, Given, reason_of
 from .law import Law, Outcome, Skip, UsageError
 from .page import Check
 
-TIMEOUT = 120.0  # seconds for each law: sound plugins take a few, those of scalar variants a dozen
-
-
-class TimedOut(BaseException):
-    """Raised within a law that takes too long. No ``except Exception`` of a plugin catches it."""
-
 
 def examine(
     kind: Callable[[Given, bool, int], Case],
@@ -33,9 +25,8 @@ def examine(
     quick: bool,
     seed: int,
     only: Iterable[str] | None = None,
-    timeout: float = TIMEOUT,
 ) -> Check:
-    """Check laws one by one; a law fails if the plugin raises while it is checked, or takes too long.
+    """Check laws one by one; a law fails if the plugin raises while it is checked.
 
     ``kind(given, quick, seed)`` makes the case that each law is called with.
     """
@@ -47,25 +38,21 @@ def examine(
             raise UsageError(f"unknown law {name!r}: choose from {', '.join(laws)}")
     start = time.perf_counter()
     variant = mi.variant()
-    with settings_restored():
+    with variant_restored():
         case = kind(given, quick, seed)
     checked = {}
-    obstacle = ""  # why the laws that are left cannot be judged
     for name in laws:
         if name in chosen:
             checked[name] = outcome = Outcome(laws[name], program=case.program)
-            obstacle = _judge(outcome, case, obstacle, timeout)
+            _judge(outcome, case)
             outcome.program = None
     return Check(case.name, variant, checked, time.perf_counter() - start, quick)
 
 
-def _judge(outcome: Outcome, case: Case, obstacle: str, timeout: float) -> str:
-    """Check one law, unless there is an obstacle; the obstacle for the laws after it, "" if none."""
-    if obstacle:
-        outcome.skip(obstacle)
-        return obstacle
+def _judge(outcome: Outcome, case: Case) -> None:
+    """Check one law."""
     try:
-        with settings_restored(), _limited(timeout):
+        with variant_restored():
             outcome.law.judge(outcome, case)
             if not outcome.holds and outcome.snippet:
                 outcome.output = _run(outcome.snippet, {case.word: case.plugin})
@@ -73,13 +60,8 @@ def _judge(outcome: Outcome, case: Case, obstacle: str, timeout: float) -> str:
             outcome.skip("; ".join(outcome.notes) or "nothing of it could be measured")
     except Skip as why:
         outcome.skip(f"{why}: {reason_of(why.__cause__)}" if why.__cause__ else str(why))
-    except TimedOut:
-        late = f"took longer than {timeout:g} s"
-        outcome.fail(f"it {late}", "a plugin must terminate", timeout)
-        return f"a law before it {late}"
     except Exception as error:
         outcome.fail(f"it raised {type(error).__name__}: {reason_of(error)}", "a plugin must not raise")
-    return ""
 
 
 def _run(program: str, names: dict[str, object]) -> str:
@@ -97,10 +79,9 @@ def _run(program: str, names: dict[str, object]) -> str:
 
 
 @contextlib.contextmanager
-def settings_restored() -> Iterator[None]:
-    """Put back the variant and Dr.Jit's flags, which a plugin or a switch of variants may change."""
+def variant_restored() -> Iterator[None]:
+    """Put back the variant, which programs switch, and warn of nothing."""
     variant = mi.variant()
-    flags = {flag: dr.flag(flag) for flag in dr.JitFlag if flag != dr.JitFlag.Default}
     try:
         # numbers that are not finite are left to the law ``finite``
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -110,26 +91,3 @@ def settings_restored() -> Iterator[None]:
     finally:
         if mi.variant() != variant:
             mi.set_variant(variant)
-        for flag, value in flags.items():
-            if dr.flag(flag) != value:
-                dr.set_flag(flag, value)
-
-
-@contextlib.contextmanager
-def _limited(seconds: float) -> Iterator[None]:
-    """Raise ``TimedOut`` in this thread's Python code after so many seconds. A kernel is not interrupted."""
-    start = time.perf_counter()
-    thread = ctypes.c_ulong(threading.get_ident())
-    interrupt = ctypes.pythonapi.PyThreadState_SetAsyncExc
-    timer = threading.Timer(seconds, interrupt, (thread, ctypes.py_object(TimedOut)))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    except Exception as error:  # Mitsuba passes on what a Python plugin raises as an error of its own
-        if time.perf_counter() - start > seconds:
-            raise TimedOut from error
-        raise
-    finally:
-        timer.cancel()
-        timer.join()  # if it is about to interrupt: then it does here, and not later

@@ -244,9 +244,9 @@ class Outcome:
             )
         )
 
-    def fail(self, what: str, why: str, limit: float = 0) -> None:
+    def fail(self, what: str, why: str) -> None:
         """Fail for a reason that is no criterion's."""
-        self.parts.append(Measurement(what, math.inf, limit, note=why))
+        self.parts.append(Measurement(what, math.inf, 0, note=why))
 
     def skip(self, reason: str) -> None:
         """Stop here. What was measured before counts; where nothing was, the law is skipped."""

@@ -34,9 +34,7 @@ class Findings:
         """Write a page (``index.html``), ``summary.json`` and ``laws.csv``. Raises ``OSError``."""
         Path(folder).mkdir(parents=True, exist_ok=True)
         for name, data in self.files().items():
-            part = Path(folder) / f".{name}.part"  # so that none is written in part
-            part.write_bytes(data)
-            part.replace(Path(folder) / name)
+            (Path(folder) / name).write_bytes(data)
 
     def _repr_html_(self) -> str:
         """The page as a frame, which leaves the style of a notebook alone."""

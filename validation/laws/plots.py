@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .faults import PLACE
 from .probe import Array
 from .sphere import Cells
 
@@ -81,12 +82,13 @@ def albedo(angles: Array, samples: Array, errors: Array, figure: Figure) -> None
     axes.legend()
 
 
-def normals(geometric: Array, shading: Array, seen: Array, figure: Figure) -> None:
-    """Normals in a square picture [N, 3] as colours (n + 1) / 2, where a surface is seen [N]."""
-    side = int(len(seen) ** 0.5)
+def normals(p: Array, geometric: Array, shading: Array, figure: Figure) -> None:
+    """Normals at points [N, 3] of a surface, seen from (0.48, 0.36, 0.8), as colours (n + 1) / 2."""
+    right = np.cross((0, 1, 0), PLACE)
+    up = np.cross(PLACE, right)
     both = {"geometric normal": geometric, "shading normal": shading}
     for axes, (name, values) in zip(figure.subplots(1, 2), both.items(), strict=True):
-        colors = np.where(seen[:, None], np.clip(0.5 * values + 0.5, 0, 1), 1)
-        axes.imshow(np.nan_to_num(colors).reshape(side, side, 3))
+        axes.scatter(p @ right, p @ up, s=2, c=np.nan_to_num(np.clip(0.5 * values + 0.5, 0, 1)))
         axes.set_title(f"{name}: (n + 1) / 2 as RGB")
+        axes.set_aspect("equal")
         axes.set_axis_off()

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from . import shape_hits, shape_samples
 from .case import Given
-from .examine import TIMEOUT, examine
+from .examine import examine
 from .law import by_name
 from .page import Check
 from .shape_case import ShapeCase
@@ -31,12 +31,11 @@ def check_shape(
     quick: bool = False,
     seed: int = 0,
     only: Iterable[str] | None = None,
-    timeout: float = TIMEOUT,
 ) -> Check:
     """Check the laws of a shape in the current variant: a dict for ``mi.load_dict``, or a loaded one.
 
     Any other object that has ``ray_intersect``, ``ray_test`` and ``bbox`` will do as well.
-    ``quick``: fewer rays. ``only``: names of ``LAWS``. ``timeout``: seconds after which a law fails that is
-    not done. Raises ``UsageError`` for anything else, and ``LoadError`` for a dict that Mitsuba cannot load.
+    ``quick``: fewer rays. ``only``: names of ``LAWS``. Raises ``UsageError`` for anything else, and
+    ``LoadError`` for a dict that Mitsuba cannot load.
     """
-    return examine(ShapeCase, shape, LAWS, quick=quick, seed=seed, only=only, timeout=timeout)
+    return examine(ShapeCase, shape, LAWS, quick=quick, seed=seed, only=only)

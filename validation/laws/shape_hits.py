@@ -14,7 +14,7 @@ from scipy import stats
 
 from . import noise, plots
 from .case import READS, READS_WHY, WAVE, class_name, reads_checked
-from .faults import SIZE, larger, member, off_surface, put, tilted
+from .faults import PLACE, SIZE, larger, member, off_surface, put, tilted
 from .law import (
     MIN_QUANTILE_ERRORS,
     SIGNIFICANCE,
@@ -228,7 +228,6 @@ def _from_near_by(law: Outcome, case: ShapeCase) -> None:
     law.check("behind", apart / (ROUNDING * largest), again, where=alike)
 
 
-PIXELS = 128  # of a side of a picture of normals
 NEIGHBOUR = """aside = mi.Vector3f({aside})
 si = scene.ray_intersect(mi.Ray3f(o, d))
 near = scene.ray_intersect(mi.Ray3f(o + 1e-3 * {size} * aside, d))
@@ -250,7 +249,7 @@ def inwards(size, si, ray):
 
 @finds("outwards", "normals inwards on this share of most faces", 3e-3, ray_intersect=inwards)
 @finds("length", "normals too long", 3e-5, ray_intersect=member("n", larger))
-@finds("slant", "normals tilted, in radians", 3e-3, ray_intersect=member("n", tilted))
+@finds("shading", "normals tilted, in radians", 3e-3, ray_intersect=member("n", tilted))
 @finds("slope", "normals tilted as well as derivatives, in radians", 0.03, ray_intersect=member("n", tilted))
 @finds("shading", "shading normals tilted, in radians", 3e-3, ray_intersect=member("sh_frame", tilted_frame))
 @finds("step", "dp_du too long", 0.02, ray_intersect=member("dp_du", larger))
@@ -276,12 +275,6 @@ def inwards(size, si, ray):
         "share of normals that turn where the same point is met from behind",
         1e-3,
         "a surface has one normal; thin parts are left room for",
-        RAY,
-    ),
-    slant=most(
-        "cosine between the normal and a partial derivative of the point",
-        1e-3,
-        "both are known to a few roundings; near a pole the derivatives are short",
         RAY,
     ),
     slope=Criterion(
@@ -315,24 +308,10 @@ def normals(law: Outcome, case: ShapeCase) -> None:
     same = back.met & near(met.p, back.p) & (back.part == met.part)
     if same.sum() > MIN_QUANTILE_ERRORS:
         law.check("turned", dot(back.n, met.n) < -0.5, met, where=same)
-    along = unit(np.stack([met.du, met.dv]))  # NaN where the derivative is 0
-    slant = abs(dot(along, met.n)).max(axis=0)
-    if np.isfinite(slant).any():
-        law.check("slant", slant, met, where=np.isfinite(slant))
     _differences(law, case)
     if not law.holds:
-        hits = _picture(case)
-        law.plot = partial(plots.normals, hits.n, hits.shading, hits.met)
-
-
-def _picture(case: ShapeCase) -> Lanes:
-    """The hits of parallel rays from a corner, those of a square picture."""
-    back = np.array([[0.48, 0.36, 0.8]])
-    right = unit(np.cross([[0, 1, 0]], back))
-    x, y = np.meshgrid(np.linspace(-0.55, 0.55, PIXELS), np.linspace(0.55, -0.55, PIXELS))
-    offsets = x.reshape(-1, 1) * right + y.reshape(-1, 1) * np.cross(back, right)
-    o = case.middle + case.size * (offsets + 1.5 * back)
-    return trace(case.target, o, np.tile(-back, (len(o), 1)))
+        towards = met[met.d @ PLACE < -0.5]
+        law.plot = partial(plots.normals, towards.p, towards.n, towards.shading)
 
 
 def _differences(law: Outcome, case: ShapeCase) -> None:

@@ -19,6 +19,7 @@ MAX_LEVEL = 17  # the finest cell is a hundred times what float32 rounding moves
 SIDE = 6
 POINTS_PER_CELL = SIDE**2  # at which a cell is integrated
 HEMISPHERE = 4**MAX_LEVEL  # codes of each
+COARSEST_LEVEL = 4
 SMALL_CELL_LEVEL = 7  # level of cells of about a degree
 MAX_DOUBTFUL = 256  # cells that are cut because samples contradict them: if more do, the density is wrong
 MAX_REFINEMENTS = 8  # at integrals that are certain enough
@@ -52,11 +53,11 @@ class Cells(Lanes):
         return Cells(start=start, level=np.full(len(start), level))
 
     @staticmethod
-    def around(codes: Array, most: int, coarsest: int = 4) -> Cells:
+    def around(codes: Array, most: int) -> Cells:
         """Cells that hold at most ``most`` of the directions each; only the finest may hold more."""
         codes = np.sort(codes)
         done = []
-        cells = Cells.uniform(coarsest)
+        cells = Cells.uniform(COARSEST_LEVEL)
         while len(cells.start):
             first, last = np.searchsorted(codes, [cells.start, cells.end])
             full = (last - first > most) & (cells.level < MAX_LEVEL)
@@ -122,11 +123,6 @@ class Cells(Lanes):
         wo, _ = self.at(half, half)
         return wo[:, 0]
 
-    @property
-    def solid_angle(self) -> Array:
-        r, _ = self.corner
-        return 2 * np.pi * self.width * ((r + self.width) ** 2 - r**2)
-
     def bounds(self, index: int) -> tuple[float, ...]:
         """r and φ from … to, and the sign of z, of one cell."""
         r, turn = (float(x[index]) for x in self.corner)
@@ -134,9 +130,9 @@ class Cells(Lanes):
         phi = 2 * np.pi * (turn - 0.5)
         return r, r + width, phi, phi + 2 * np.pi * width, -1 if self.below[index] else 1
 
-    def counts(self, codes: Array, weights: Array | None = None) -> Array:
-        """Number of directions in each cell, or the sum of their weights. [C]"""
-        return np.bincount(self.find(codes), weights, minlength=len(self.start))
+    def counts(self, codes: Array) -> Array:
+        """Number of directions in each cell. [C]"""
+        return np.bincount(self.find(codes), minlength=len(self.start))
 
     def integrals(self, function: Function, rng: np.random.Generator) -> tuple[Array, Array]:
         """Integrals of ``function(directions [N, 3]) -> [N]`` over cells, and their variances. [C], [C]"""
