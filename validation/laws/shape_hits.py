@@ -128,7 +128,7 @@ def close(size, si, ray):
     ),
     near_by=Criterion(
         0.5,
-        "hit point off a ray of a twentieth of the size, in roundings of the largest coordinate, median",
+        "hit point off a ray of a thousandth of the size, in roundings of the largest coordinate, median",
         MAX_MEDIAN_ROUNDINGS,
         "a few operations",
         RAY,
@@ -169,10 +169,6 @@ def surface(law: Outcome, case: ShapeCase) -> None:
     law.check("on_ray", _off_ray(met) / (ROUNDING * largest), met)
     _from_near_by(law, case)
     _again(law, case)
-    step = 1e-3 * case.size
-    again = trace(case.target, met.p - step * met.d, met.d)
-    missed = ~again.met | (norm(again.p - met.p, axis=1) >= step)
-    law.check("missed", missed, again)
     _noise(law, case)
 
 
@@ -215,8 +211,9 @@ def _from_near_by(law: Outcome, case: ShapeCase) -> None:
     """From near by, and from the other side, numbers are small, and points that are off show."""
     met = case.few(case.met, 2**12, 2**15)
     d = met.d
-    reach = 0.05 * case.size
+    reach = 1e-3 * case.size
     again = trace(case.target, met.p - reach * d, d)
+    law.check("missed", ~again.met | (norm(again.p - met.p, axis=1) >= reach), again)
     same = again.met & near(met.p, again.p)
     largest = abs(met.p).max(axis=1) + reach
     # the same line the other way around, from as far behind
