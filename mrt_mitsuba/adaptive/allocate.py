@@ -11,14 +11,14 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.adaptive.estimate import HALVES, PILOTS, SUBSET_PIXELS, Forecast, SampleStatistics
+from mrt_mitsuba.adaptive.estimate import HALVES, PILOTS, Forecast, SampleStatistics
 from mrt_mitsuba.filters.grid import window_means
 from mrt_mitsuba.rendering.exposing import widened
 from mrt_mitsuba.rendering.film import Film
 
 PILOT_RATIO = 1 / 12  # rays of pilots over those of halves
 ROUNDING_TILE = 16  # pixels that share a rounding offset under a filter, which adds rays around each of them
-ALLOCATION_ITERATIONS = 8  # trials of a factor that makes whole groups use up the budget
+ALLOCATION_ITERATIONS = 16  # trials of a factor that makes whole groups use up the budget
 FILLED = 0.995  # fraction of the budget that counts as used up
 
 
@@ -72,7 +72,7 @@ class Allocator:
             return best
         low = 0.0
         high = float((budget + known) / deviation.sum())
-        factor = _factor(deviation, have, budget)
+        factor = high
         trials = 0
         while low == 0 or trials < ALLOCATION_ITERATIONS:
             trials += 1
@@ -108,20 +108,3 @@ class Allocator:
 def _smoothed(variance: np.ndarray) -> np.ndarray:
     """Return standard deviations [H, W], box-filtered: per-pixel estimates are too noisy."""
     return window_means(np.sqrt(variance + 1e-30), 1)
-
-
-def _factor(deviation: np.ndarray, have: np.ndarray, budget: float) -> float:
-    """Return rays per unit deviation that use up the budget, from a subset of the pixels.
-
-    Pixels keep the rays they have. Found without rounding.
-    """
-    step = max(1, deviation.size // SUBSET_PIXELS)
-    every = deviation[::step]
-    there = have[::step].astype(np.float32)
-    low = 0.0
-    high = float((budget + have.sum()) / deviation.sum())
-    for _ in range(24):
-        factor = (low + high) / 2
-        enough = step * float(np.maximum(factor * every - there, 0).sum()) > budget
-        low, high = (low, factor) if enough else (factor, high)
-    return high
