@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 from collections.abc import Iterator
 from functools import cache
 
@@ -49,10 +48,7 @@ def use(variant: str | None = None) -> str:
         if variant is None:
             variant = mi.variant() or default_variant()
         elif variant not in mi.variants():
-            close = difflib.get_close_matches(variant, mi.variants(), n=1)
-            known = ", ".join(mi.variants())
-            hint = f" Did you mean {close[0]}?" if close else ""
-            raise UsageError(f"unknown variant {variant!r}.{hint} This Mitsuba has {known}.")
+            raise UsageError(f"unknown variant {variant!r}: this Mitsuba has {', '.join(mi.variants())}")
         if problem := obstacle(variant):
             raise VariantError(f"the variant {variant} cannot be used: {problem}")
         if mi.variant() != variant:

@@ -37,22 +37,20 @@ def replacing(*paths: StrPath, inputs: Iterable[StrPath] = ()) -> Iterator[list[
     ``check_target``.
     """
     with contextlib.ExitStack() as stack:
-        files = []
-        targets = []
+        targets: dict[IO[bytes], str] = {}  # by the new file
         for path in paths:
             with _explained(path):
                 target = _target(path, inputs)
-                files.append(stack.enter_context(_temporary(os.path.dirname(target))))
-                targets.append(target)
+                targets[stack.enter_context(_temporary(os.path.dirname(target)))] = target
         with _explained(*paths):
-            yield files
-            for file, target in zip(files, targets, strict=True):
+            yield [*targets]
+            for file, target in targets.items():
                 file.flush()
                 os.fsync(file.fileno())
                 if os.path.exists(target):
                     os.chmod(file.name, stat.S_IMODE(os.stat(target).st_mode))
             with defer_signals():  # an interrupt in between is raised afterwards
-                for file, target in zip(files, targets, strict=True):
+                for file, target in targets.items():
                     os.replace(file.name, target)
 
 

@@ -240,7 +240,7 @@ def camera_matrices(sensor: mi.Sensor) -> dict[str, np.ndarray]:
         return {}
     from_world = np.linalg.inv(to_world)
     # Mitsuba's cameras look along +z, with x to the left
-    matrices = {"worldToCamera": np.diag([-1.0, 1.0, -1.0, 1.0]) @ from_world}
+    matrices = {"worldToCamera": (np.diag([-1.0, 1.0, -1.0, 1.0]) @ from_world).T}
     numbers = mi.traverse(sensor)
     if "x_fov" in numbers:
         film = sensor.film()
@@ -248,8 +248,8 @@ def camera_matrices(sensor: mi.Sensor) -> dict[str, np.ndarray]:
         shift = [np.array(numbers.get(name, 0.0)).item() for name in names]  # which Mitsuba leaves out
         projection = np.array(sensor.projection_transform().matrix, np.float64).reshape(4, 4)
         projection[:2, 2] -= np.multiply(shift, film.size()) / film.crop_size()
-        matrices["worldToNDC"] = projection @ from_world
-    return {name: matrix.T for name, matrix in matrices.items()}
+        matrices["worldToNDC"] = (projection @ from_world).T
+    return matrices
 
 
 def to_rgb(spectrum: mi.UnpolarizedSpectrum, ray: mi.Ray3f) -> mi.Color3f:

@@ -88,8 +88,8 @@ def load_file(
     inputs = set() if inputs is None else inputs
     keys = {key: value for key, value in params.items() if "." in key}
     given = {name: str(value) for name, value in params.items() if name not in keys}
-    numbers = {name: value for name, value in (options or {}).items() if isinstance(value, str | int | float)}
-    offered = {name: str(value) for name, value in numbers.items()} | given
+    plain = (option for option in (options or {}).items() if isinstance(option[1], str | int | float))
+    offered = {name: str(value) for name, value in plain} | given
     with _loading(path, os.path.dirname(path) or "."):
         expansion = Expansion(dict(offered))
         expansion.read(path)

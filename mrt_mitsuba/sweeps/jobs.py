@@ -70,7 +70,8 @@ def points(grid: object, zipped: bool) -> dict[str, Values]:
         raise UsageError(f"the grid has more than {MAX_JOBS} jobs: make several sweeps of it")
     if zipped:  # as video encoders expect them
         return {f"frame_{number:04}": point for number, point in enumerate(combinations)}
-    names = [_name(point) for point in combinations]
+    words = (",".join(f"{word(key)}={word(value)}" for key, value in each.items()) for each in combinations)
+    names = [text or "picture" for text in words]
     ((name, count),) = Counter(map(str.casefold, names)).most_common(1)  # some file systems ignore case
     if count > 1:
         raise UsageError(
@@ -78,10 +79,6 @@ def points(grid: object, zipped: bool) -> dict[str, Values]:
             "numbers the files"
         )
     return dict(zip(names, combinations, strict=True))
-
-
-def _name(point: Values) -> str:
-    return ",".join(f"{word(key)}={word(value)}" for key, value in point.items()) or "picture"
 
 
 def _axis(key: object, values: Any) -> list[Any]:

@@ -57,8 +57,11 @@ class Table:
         return [row for row in self.rows if row["error"]]
 
     def __str__(self) -> str:
-        made = len(self._ended) - len(self.failed)
-        return f"{made} of {len(self._points)} pictures in {self.folder}"
+        return f"{self._made} in {self.folder}"
+
+    @property
+    def _made(self) -> str:
+        return f"{len(self._ended) - len(self.failed)} of {len(self._points)} pictures"
 
     def mean(self) -> Result:
         """Return the mean of pictures that differ in their seed alone.
@@ -70,13 +73,11 @@ class Table:
             raise UsageError(
                 f"mean: the pictures differ in {', '.join(self.keys) or 'nothing'}, not in their seed alone"
             )
-        done = [row for row in self.rows if not row["error"]]
-        if len(done) < 2 or self.failed:
-            text = f"mean: {len(done)} of {len(self._points)} pictures are there: run the sweep again"
-            raise UsageError(
-                text if self.failed else "mean: one picture has no spread: give two seeds or more"
-            )
-        return mean_of_seeds(self.folder, self._job, done)
+        if self.failed:
+            raise UsageError(f"mean: {self._made} are there: run the sweep again")
+        if len(self.rows) < 2:
+            raise UsageError("mean: one picture has no spread: give two seeds or more")
+        return mean_of_seeds(self.folder, self._job, self.rows)
 
     def add(self, job: Job, facts: Facts) -> None:
         """Add the row of a job that ended; ``write`` follows at most once a second."""
