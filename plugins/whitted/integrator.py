@@ -227,7 +227,8 @@ class MrtWhitted(mi.SamplingIntegrator):
             sampler=sampler if data.facts.random_lights else None,
         )
         # The camera ray, which the layers look at, comes before the loop
-        path, hit = self._follow(data, path, data.eye_buffer)
+        eye = data.eye_buffers[0][0] if data.eye_buffers else None
+        path, hit = self._follow(data, path, eye)
         direct = path.radiance
         if data.plan.mirrors:
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
@@ -19,7 +18,7 @@ from .facts import Reading
 from .hit_errors import HitErrors
 from .lights import Lights
 from .materials import MaterialTable, has_mirror
-from .plan import KernelPlan, SceneFacts
+from .plan import KernelPlan
 from .shapes import Planes, Spheres
 from .snapshot import Cache
 
@@ -80,13 +79,22 @@ class SceneData:
         self.lights = cache(
             "lights", (now.light_part, plan.lights), Lights, reading.lights, reading.light_rows, plan.lights
         )
+        things = [thing for thing in (traced.quadrics, traced.spheres) if thing is not None]
+        blockers = things if plan.light_buffers else []
         light_key = now.light_part, plan.light_buffers, *self._shape_key
-        self.light_buffers = cache("light buffers", light_key, _light_buffers, reading, plan, traced)
+        places = [row[0] for row in reading.light_rows or ()]
+        #: lists of the objects that may block each light, with the objects, which test rays
+        self.light_buffers = cache("light buffers", light_key, _buffers, places, blockers)
+        seen = [traced.quadrics] if plan.eye_buffer and traced.quadrics is not None else []
         eye_key = now.eye, plan.eye_buffer, *self._shape_key
-        self.eye_buffer = cache("eye buffer", eye_key, _eye_buffer, reading, plan, traced)
+        #: the same of the quadrics that the camera may see
+        self.eye_buffers = cache("eye buffers", eye_key, _buffers, [now.eye], seen)
         material_key = now.shape_part, now.material_part, plan.merged
         self.merged = cache("merged", material_key, _material_table, reading, plan)
-        self.path_bound = _path_bound(reading.facts, plan)
+        #: of what a path may still bring, as data: a brighter sky needs no new kernel
+        self.path_bound = plan.contribution_bounds[0]
+        if is_jit() and self.path_bound < dr.inf:
+            self.path_bound = dr.opaque(mi.Float, self.path_bound)
         self.ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
         self.ray_flags |= +mi.RayFlags.dPdUV if plan.tangents else 0
 
@@ -102,7 +110,7 @@ class SceneData:
             return None
         rays = self._cache("rays", self._shape_key, _ray_arrays, self.bvh) if plan.bvh else []
         own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged]
-        return [*_arrays_in([*own, self.light_buffers, self.eye_buffer]), *rays, self.path_bound, sky]
+        return [*_arrays_in([*own, self.light_buffers, self.eye_buffers]), *rays, self.path_bound, sky]
 
     # ----------------------------------------- Ray queries ---------------------------------------------
 
@@ -239,37 +247,19 @@ def _trace(reading: Reading, plan: KernelPlan) -> Traced:
     return Traced(bvh, Planes(planes), quadrics, HitErrors(others), spheres)
 
 
-def _light_buffers(
-    reading: Reading, plan: KernelPlan, traced: Traced
+def _buffers(
+    places: list, things: Sequence[Quadrics | Spheres]
 ) -> list[tuple[PointBuffer, Quadrics | Spheres]]:
-    """Return lists of the objects that may block each light, with the objects, which test rays."""
-    if not plan.light_buffers:
+    """Return lists of the things around points, with the things; none of no thing."""
+    if not things:
         return []
-    from .buffers import PointBuffer
+    from .buffers import PointBuffer  # only for scenes that have some
 
-    positions = np.array([row[0] for row in reading.light_rows or ()])
-    things = [thing for thing in (traced.quadrics, traced.spheres) if thing is not None]
-    return [(PointBuffer(positions, *thing.boxes()), thing) for thing in things]
-
-
-def _eye_buffer(reading: Reading, plan: KernelPlan, traced: Traced) -> PointBuffer | None:
-    """Return lists of the quadrics that the camera may see."""
-    if not plan.eye_buffer or traced.quadrics is None:
-        return None
-    from .buffers import PointBuffer
-
-    return PointBuffer(np.array([reading.snapshot.eye]), *traced.quadrics.boxes())
+    return [(PointBuffer(np.array(places), *thing.boxes()), thing) for thing in things]
 
 
 def _material_table(reading: Reading, plan: KernelPlan) -> MaterialTable | None:
     return MaterialTable(reading.snapshot.shapes, reading.materials) if plan.merged else None
-
-
-def _path_bound(facts: SceneFacts, plan: KernelPlan) -> float | mi.Float:
-    """Return the bound of what a path may still bring, as data: a brighter sky needs no new kernel."""
-    bound = plan.contribution_bounds[0]
-    fixed = bound in (0, math.inf, facts.lights + 1)
-    return bound if fixed or not is_jit() else dr.opaque(mi.Float, bound)
 
 
 def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:

@@ -142,7 +142,7 @@ def test_lists_around_the_eye_follow_the_camera():
             assert_array_equal(*map(np.array, pictures))
         data = lists.prepare(scene)
         assert data.quadrics is trees
-        assert_allclose(np.ravel(data.eye_buffer.place), (x, 1, 4))
+        assert_allclose(np.ravel(data.eye_buffers[0][0].place), (x, 1, 4))
         assert_array_equal(again().image, mrt.render(scene, **size).image)
 
 
