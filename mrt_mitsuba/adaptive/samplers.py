@@ -1,8 +1,8 @@
 """Samplers for Mitsuba, executed once for each variant.
 
 Each declares what adaptive sampling needs: ``group``, the rays of a pixel that are traced together;
-``fields``, the number of sets of pixels whose samples are independent of each other; ``gain``, the excess
-convergence rate: variance falls as n^−(1 + gain); and ``spacing``, between preferred sample counts.
+``gain``, the excess convergence rate: variance falls as n^−(1 + gain); and ``spacing``, between preferred
+sample counts.
 ``ADAPTIVE`` names the one that adaptive sampling uses.
 """
 
@@ -32,7 +32,6 @@ class RaySampler(mi.Sampler):
     """
 
     group = 2
-    fields = 2
     gain = 0.0
 
     def __init__(self, props: Any) -> None:
@@ -80,7 +79,6 @@ class PixelSequence(mi.Sampler):
     """
 
     group = 2
-    fields = 2
     gain = 0.4
 
     def __init__(self, props: Any) -> None:
