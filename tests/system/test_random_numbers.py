@@ -10,7 +10,7 @@ import pytest
 from cases import Cases
 
 import mrt_mitsuba as mrt
-from mrt_mitsuba.rendering import exposing
+from mrt_mitsuba.rendering import exposing, whole
 from mrt_mitsuba.rendering.film import derived_seed
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -91,7 +91,7 @@ def test_parts_of_a_whole_picture_draw_numbers_of_their_own(monkeypatch):
     scene = mi.load_dict(box)
     options = {"integrator": "ptracer", "aamode": "none", "seed": 3}
     few = mrt.render(scene, spp=8, **options)
-    monkeypatch.setattr(exposing, "wavefront_size", lambda space, channels: few.rays["primary"])
+    monkeypatch.setattr(whole, "wavefront_size", lambda space, channels: few.rays["primary"])
     many = mrt.render(scene, spp=16, **options)
     assert many.rays["primary"] == 2 * few.rays["primary"]
     assert not np.allclose(many.image, few.image, rtol=1e-4)
