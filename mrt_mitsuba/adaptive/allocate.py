@@ -11,7 +11,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from mrt_mitsuba.adaptive.estimate import HALVES, PILOTS, Forecast, SampleStatistics
+from mrt_mitsuba.adaptive.estimate import HALVES, PILOTS, PilotEstimate, SampleStatistics
 from mrt_mitsuba.filters.grid import window_means
 from mrt_mitsuba.rendering.exposing import widened
 from mrt_mitsuba.rendering.film import Film
@@ -36,14 +36,14 @@ class Allocator:
         """An allocation with groups around the pixels of halves as far as the filter reaches."""
         return np.concatenate([widened(self.film, allocation[HALVES]), allocation[PILOTS]])
 
-    def required_spp(self, stats: SampleStatistics, forecast: Forecast, rmse: float) -> float:
+    def required_spp(self, stats: SampleStatistics, pilots: PilotEstimate, rmse: float) -> float:
         """Total mean spp that reaches an RMSE, as predicted by the pilots."""
-        deviation = np.sqrt(forecast.variance, dtype=np.float64)
+        deviation = np.sqrt(pilots.variance, dtype=np.float64)
         half = np.maximum(deviation * (deviation.mean() / (2 * rmse**2)), stats.count[0])
         return float(2 * (half - stats.count[0]).mean() + stats.count.sum(0).mean())
 
     def allocate(
-        self, stats: SampleStatistics, forecast: Forecast, spp: float, floor: float = 0.0
+        self, stats: SampleStatistics, pilots: PilotEstimate, spp: float, floor: float = 0.0
     ) -> np.ndarray:
         """Allocation that raises the mean to ``spp`` rays of a pixel.
 
@@ -51,12 +51,12 @@ class Allocator:
         """
         budget = (spp * self.film.pixels - float(stats.count.sum())) / 2 / (1 + PILOT_RATIO)
         rounding = self._rounding(stats)
-        deviation = _smoothed(forecast.variance)
+        deviation = _smoothed(pilots.variance)
         deviation = np.maximum(deviation, floor * deviation.mean())
         half = self._shares(stats.count[0], deviation, budget, rounding)
         wanted = PILOT_RATIO * (stats.count[0].ravel() + self._group * half)
-        pilots = self._groups_to(wanted, stats.count[2].ravel(), rounding.ravel())
-        return np.stack([half, half, pilots, pilots])
+        more = self._groups_to(wanted, stats.count[2].ravel(), rounding.ravel())
+        return np.stack([half, half, more, more])
 
     def _shares(
         self, have: np.ndarray, deviation: np.ndarray, budget: float, rounding: np.ndarray

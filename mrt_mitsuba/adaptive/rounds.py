@@ -18,10 +18,10 @@ from mrt_mitsuba.adaptive.denoise import Denoiser, cautious_error
 from mrt_mitsuba.adaptive.error import ErrorEstimate, Round, RoundPicture
 from mrt_mitsuba.adaptive.estimate import (
     Blurred,
-    Forecast,
+    PilotEstimate,
     SampleStatistics,
     estimate_error,
-    forecast,
+    pilot_estimate,
     pixel_error,
     pixel_variance,
 )
@@ -41,7 +41,7 @@ MIN_GROWTH = 1.05  # minimum growth for which another round pays off
 MIN_RAYS = 2**17  # of a picture with a target: fewer do not show what is rare
 ENOUGH = 0.9  # fraction of them that counts as all, as allocations are rounded
 MIN_RELATIVE_DEVIATION = 0.25  # fraction of the mean deviation that each pixel has, until there are MIN_RAYS
-TARGET_MARGIN = 0.97  # fraction of the target aimed for: a forecast is as often too low as too high
+TARGET_MARGIN = 0.97  # fraction of the target aimed for: what is foreseen is as often too low as too high
 SAFETY = 1.5  # standard errors of the RMSE below the target, so that few pictures exceed it
 
 OnRound = Callable[[RoundPicture], object]
@@ -187,7 +187,7 @@ def plan_round(
         most = min(most, now.spp * goal.max_seconds / now.seconds)
     if most < MIN_GROWTH * now.spp:
         return None
-    seen = forecast(stats)
+    seen = pilot_estimate(stats)
     if target is None:
         return allocator.allocate(stats, seen, most)
     minimum = min(MIN_RAYS / stats.film.pixels, goal.max_spp)
@@ -205,7 +205,7 @@ def plan_round(
 
 
 def _nonempty(
-    allocator: Allocator, stats: SampleStatistics, seen: Forecast, spp: float, most: float
+    allocator: Allocator, stats: SampleStatistics, seen: PilotEstimate, spp: float, most: float
 ) -> np.ndarray:
     """Return an allocation that raises the mean to ``spp``, or further where whole groups exceed that."""
     allocation = allocator.allocate(stats, seen, spp)

@@ -189,9 +189,9 @@ class _Estimates:
 
 
 def _correlated_reach(noise: np.ndarray) -> int:
-    """Distance, in pixels, up to which noise [H, W] is correlated: 0, 1, 2 or 4.
+    """Return the distance in pixels, 0, 1, 2 or 4, up to which the noise [H, W] is correlated.
 
-    That of a box filter is not; wider reconstruction filters share samples among pixels.
+    Noise under a box filter is not; wider reconstruction filters share samples among pixels.
     """
     power = float(np.square(noise).mean())
     if power == 0:
@@ -207,7 +207,7 @@ def _correlated_reach(noise: np.ndarray) -> int:
 
 
 def _interval(squares: np.ndarray) -> tuple[float, float, float]:
-    """Root of the mean of estimated squared errors, with its 95 % interval from the spread of blocks."""
+    """Return the RMSE and the ends of its 95 % interval, by squared errors [H, W] and spread of blocks."""
     rows, columns = squares.shape
     sums = np.add.reduceat(squares, range(0, rows, BLOCK), 0)
     sums = np.add.reduceat(sums, range(0, columns, BLOCK), 1)

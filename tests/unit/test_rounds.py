@@ -18,7 +18,7 @@ from numpy.testing import assert_array_equal
 import mrt_mitsuba as mrt
 from mrt_mitsuba.adaptive import rounds
 from mrt_mitsuba.adaptive.denoise import Denoiser
-from mrt_mitsuba.adaptive.estimate import Sums, forecast, pixel_variance
+from mrt_mitsuba.adaptive.estimate import Sums, pilot_estimate, pixel_variance
 from mrt_mitsuba.adaptive.rounds import Tracer, run_rounds
 from mrt_mitsuba.adaptive.tails import PARETO_K_THRESHOLD, tail_shape
 from mrt_mitsuba.adaptive.target import Goal, Target
@@ -102,7 +102,7 @@ def pilots_alone(monkeypatch):
     plan = rounds.plan_round
 
     def foreseen(allocator: Any, stats: Any, goal: Any, target: Any, now: Any) -> Any:
-        return plan(allocator, stats, goal, target, replace(now, rmse=forecast(stats).rmse))
+        return plan(allocator, stats, goal, target, replace(now, rmse=pilot_estimate(stats).rmse))
 
     monkeypatch.setattr(rounds, "plan_round", foreseen)
 
@@ -231,7 +231,7 @@ def test_a_forecast_is_the_error_of_the_mean_of_both_halves(groups):
         tracer = Tracer(Draws(draw), seed)  # type: ignore[arg-type]
         first = groups * tracer.initial_allocation
         stats = tracer.trace(tracer.blank("linear"), first, lambda rays: None)
-        squares.append(forecast(stats).rmse ** 2)
+        squares.append(pilot_estimate(stats).rmse ** 2)
     rays = stats.count[:2].sum(0)
     assert (rays == 4 * groups).all()
     assert np.mean(squares) ** 0.5 == pytest.approx(rays.mean() ** -0.5, rel=0.08)
@@ -243,7 +243,7 @@ def test_a_filter_makes_a_forecast_less_certain():
     for rfilter in ("box", "gaussian"):
         tracer = Tracer(Draws(_calm, rfilter=rfilter), seed=0)  # type: ignore[arg-type]
         stats = tracer.trace(tracer.blank("linear"), tracer.initial_allocation, lambda rays: None)
-        found.append(forecast(stats).uncertainty)
+        found.append(pilot_estimate(stats).uncertainty)
     assert found[1] / found[0] == pytest.approx(tracer.film.correlation**0.5)
 
 
@@ -407,7 +407,7 @@ def test_shares_take_all_the_room_there_is_and_no_more(rfilter, least):
 
     tracer = Tracer(Draws(draw, rfilter=rfilter), seed=0)  # type: ignore[arg-type]
     stats = tracer.trace(tracer.blank("linear"), tracer.initial_allocation, lambda rays: None)
-    seen = forecast(stats)
+    seen = pilot_estimate(stats)
     for most in np.linspace(20, 40, 101):
         allocation = tracer.allocator.allocate(stats, seen, most)
         taken = (tracer.cost(allocation) / PIXELS + 8) / most
