@@ -19,6 +19,7 @@ from mrt_mitsuba.rendering.exposing import Exposer
 from mrt_mitsuba.rendering.film import Film
 from mrt_mitsuba.rendering.settings import RenderOptions, RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
+from mrt_mitsuba.scene.open import opened
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -72,8 +73,9 @@ class Prepared:
                 "the film has another size or crop window than before, but width or height was given to "
                 "prepare: leave them out there, or call prepare with others"
             )
-        _, _, width, height, *_ = window
-        self._source = replace(self._source, width=width, height=height)
+        source = self._source
+        now = opened(source.name, source.scene, source.sensor, source.integrator)
+        self._source = replace(source, width=now.width, height=now.height)
         self._film_window = window
 
     def _render(self, seed: int) -> Result:
