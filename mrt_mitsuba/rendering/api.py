@@ -30,7 +30,7 @@ from mrt_mitsuba.rendering.exposing import FILM_PREFIX
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, make_plan
 from mrt_mitsuba.rendering.progress import Job, Progress, Timings, default_progress
-from mrt_mitsuba.rendering.settings import Convention, Lattice, RenderSettings
+from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import Source, open_scene, sized
 
@@ -131,7 +131,7 @@ def render(  # noqa: PLR0913 - each option has a name that editors show
     denoise: bool = False,
     maxspp: int | None = None,
     maxseconds: float | None = None,
-    lattice: Lattice | None = None,
+    lattice: Literal["report", "centered", "film"] | None = None,
     fresnel: Literal["schlick", "dielectric"] | None = None,
     focaldist: float | None = None,
     focalrange: float | None = None,
@@ -139,12 +139,10 @@ def render(  # noqa: PLR0913 - each option has a name that editors show
     layers: Sequence[str] | str = (),
     motion: Sequence[float] | None = None,
     motionsamples: int = 16,
-    convention: Convention = "report",
-    texturing: Convention | None = None,
+    convention: Literal["report", "standard"] = "report",
     camera: Sequence[float] | None = None,
     up: Sequence[float] | None = None,
     fov: float | None = None,
-    light: Sequence[float] | None = None,
     variant: str | None = None,
     memory: int | str | None = None,
     seed: int = 0,

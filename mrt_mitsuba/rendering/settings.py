@@ -1,16 +1,16 @@
 """The options of ``mrt.render``: ``RenderSettings`` holds and checks them, also for the command, which adds
-its own; ``RenderOptions`` has their types for editors.
+its own.
 
-A new option is a field, a type in ``RenderOptions`` and a parameter of ``render``.
+A new option is a field and a parameter of ``render``.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Any
 
 from mrt_mitsuba.adaptive.target import METRIC_NAMES, Goal, Target
 from mrt_mitsuba.errors import UsageError
@@ -40,8 +40,6 @@ from mrt_mitsuba.scene.model import CONVENTION, FRESNEL, MODEL_OPTIONS, SIDE, SI
 if TYPE_CHECKING:
     from mrt_mitsuba.adaptive.error import RoundPicture
 
-Convention = Literal["report", "standard"]
-Lattice = Literal["report", "centered", "film"]
 #: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
 #: the order of its arguments; those of the picture can distinguish noise from edges
 DETECTORS = {"luma": ("image",), "sobel": ("image",), "geometry": ("normal", "depth")}
@@ -53,44 +51,6 @@ NOISE = "noise"  # the aamode that allocates samples by variance
 MIN_SPP = 16  # samples per pixel from which the variance is estimated
 MAX_SPP = 4096  # mean samples per pixel, where a target alone would ask for more
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
-
-
-class RenderOptions(TypedDict, total=False):
-    """The options of ``render`` as type checkers see them where a function takes ``**options``."""
-
-    width: int | None
-    height: int | None
-    aa: int | None
-    aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None
-    target: Target | float | str | Sequence[float] | None
-    metric: Literal["linear", "relative", "display"] | None
-    denoise: bool
-    maxspp: int | None
-    maxseconds: float | None
-    lattice: Lattice | None
-    fresnel: Literal["schlick", "dielectric"] | None
-    focaldist: float | None
-    focalrange: float | None
-    dof: Literal["report", "corrected"]
-    layers: Sequence[str] | str
-    motion: Sequence[float] | None
-    motionsamples: int
-    convention: Convention
-    texturing: Convention | None
-    camera: Sequence[float] | None
-    up: Sequence[float] | None
-    fov: float | None
-    light: Sequence[float] | None
-    variant: str | None
-    memory: int | str | None
-    seed: int
-    integrator: Any
-    sensor: int
-    on_round: Callable[[RoundPicture], object] | None
-    spp: int | None
-    count_rays: bool
-    params: Mapping[str, Any] | None
-    progress: Progress | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,20 +116,11 @@ class RenderSettings:
     )
     motionsamples: int = option(16, integer(1, 65536), "moments at which motion blur sees the scene")
     convention: str = option("report", CONVENTION, "MTL files: Ni is the roughness, or the IOR")
-    texturing: str | None = option(
-        None,
-        CONVENTION,
-        "textures of an OBJ file: nearest texel, or bilinear from sRGB",
-        "as convention",
-    )
     camera: tuple[float, ...] | None = option(
         None, VECTOR, "OBJ file: where the camera is", "by the model's size"
     )
     up: tuple[float, ...] | None = option(None, VECTOR, "OBJ file: what is up", "0,1,0")
     fov: float | None = option(None, ANGLE, "OBJ file: horizontal field of view", "60")
-    light: tuple[float, ...] | None = option(
-        None, VECTOR, "OBJ file: where a white light is, in place of the two", "two, by the model's size"
-    )
     variant: str | None = option(None, NAME, "Mitsuba variant", "llvm_ad_rgb, without LLVM scalar_rgb")
     memory: int | None = option(
         None, BYTES, "memory to stay within: a number, with K, M, G or T for a unit", "half of what is free"

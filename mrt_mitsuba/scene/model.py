@@ -35,7 +35,7 @@ FLAVORS = ("mrt", "stock")  # this project's plugins, or Mitsuba's own
 MAX_FLOAT = 3.4e38  # largest float32
 FOCAL_RANGE = 2.0  # half-width of the sharp zone
 # Options that apply to OBJ files only
-MODEL_OPTIONS = ("convention", "texturing", "camera", "target", "up", "fov", "light")
+MODEL_OPTIONS = ("convention", "camera", "target", "up", "fov")
 
 
 @dataclass(frozen=True)

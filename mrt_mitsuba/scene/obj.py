@@ -21,7 +21,7 @@ import numpy as np
 from mrt_mitsuba.errors import SceneError, UsageError
 from mrt_mitsuba.options import StrPath, check
 from mrt_mitsuba.scene.files import MISSING, decode, find, read_text, warn_of
-from mrt_mitsuba.scene.model import BLUE_SKY, CONVENTION, Camera, Light, Material, Mesh, Scene, Vector
+from mrt_mitsuba.scene.model import BLUE_SKY, CONVENTION, Camera, Light, Material, Mesh, Scene
 from mrt_mitsuba.scene.mtl import DEFAULT_MATERIAL, find_material, read_mtl
 from mrt_mitsuba.scene.polygons import triangulate
 
@@ -255,21 +255,13 @@ def _mesh(values: Sequence[np.ndarray], triangles: np.ndarray, material: Materia
 # ------------------------------------------- Camera and lights -----------------------------------------
 
 
-def obj_scene(
-    path: StrPath,
-    *,
-    convention: str = "report",
-    texturing: str | None = None,
-    light: Vector | None = None,
-    **view: Any,
-) -> Scene:
+def obj_scene(path: StrPath, *, convention: str = "report", **view: Any) -> Scene:
     """Return the scene of an OBJ file; by default, camera and lights are placed by the model's size.
 
     The camera stands in front, towards +z, a little above and to the right, and sees all of it; a light is up
-    on each side, the right one brighter. ``texturing`` follows ``convention`` unless given. ``light``: where
-    a single white light is, instead of these two; ``view``: ``camera``, ``target`` and ``up`` (vectors) and
-    ``fov`` (horizontal, in degrees), as ``render`` takes them. Raises ``UsageError`` for a camera that sees
-    nothing, and what ``read_obj`` raises.
+    on each side, the right one brighter. Textures are looked up by ``convention``, too. ``view``: ``camera``,
+    ``target`` and ``up`` (vectors) and ``fov`` (horizontal, in degrees), as ``render`` takes them. Raises
+    ``UsageError`` for a camera that sees nothing, and what ``read_obj`` raises.
     """
     meshes, files = read_obj(path, convention=convention)
     low = np.min([m.vertices.min(axis=0) for m in meshes], axis=0).astype(float)
@@ -279,10 +271,6 @@ def obj_scene(
     radii = np.array([(0, 0, 0), (1.0, 0.8, 2.4), (4, 5, 4), (-4, 3, 5)])
     places = (low + high) / 2 + radius * radii
     center, eye, right, left = map(tuple, places.tolist())
-    if light is not None:
-        lights = [Light(light, (2.5, 2.5, 2.5))]
-    else:
-        lights = [Light(right, (2.5, 2.5, 2.5)), Light(left, (1.0, 1.0, 1.2))]
     fields = {"camera": "position", "fov": "hfov"}
     given = {fields.get(name, name): value for name, value in view.items()}
     camera = replace(Camera(eye, center), **given)
@@ -293,8 +281,8 @@ def obj_scene(
         title=os.path.basename(path),
         camera=camera,
         sky=BLUE_SKY,
-        lights=tuple(lights),
+        lights=(Light(right, (2.5, 2.5, 2.5)), Light(left, (1.0, 1.0, 1.2))),
         meshes=meshes,
-        texturing=texturing or convention,
+        texturing=convention,
         files=files,
     )

@@ -21,7 +21,6 @@ import numpy as np
 
 from mrt_mitsuba.errors import UsageError
 from mrt_mitsuba.options import Values
-from mrt_mitsuba.rendering.api import open_with
 from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.runtime import use, versions
 from mrt_mitsuba.scene.files import require_file
@@ -162,21 +161,6 @@ def _sendable(scene: Any) -> Any:
         report_scene(operator.index(scene))  # refuses a number without a scene
         return operator.index(scene)
     return scene
-
-
-def check_parameters(jobs: Sequence[Job]) -> None:
-    """Raise ``UsageError`` if a job sets what its scene does not have.
-
-    Loads each scene once for values of the same types.
-    """
-    opened = set()
-    for job in jobs:
-        params = job.arguments.get("params") or {}
-        names = {name: value if "." not in name else type(value).__name__ for name, value in params.items()}
-        which = fingerprint(job.scene, names)
-        if params and which not in opened:
-            opened.add(which)
-            open_with(job.scene, RenderSettings.of(**job.arguments))
 
 
 # ------------------------------------------- On the way to workers ---------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import closing
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mitsuba as mi
 
@@ -12,16 +12,13 @@ from mrt_mitsuba import runtime, user_plugins
 from mrt_mitsuba.errors import UsageError, needs_extra
 from mrt_mitsuba.files.replacing import make_folder
 from mrt_mitsuba.options import StrPath, Values, check, integer
+from mrt_mitsuba.rendering.api import open_with
 from mrt_mitsuba.rendering.progress import TerminalProgress
+from mrt_mitsuba.rendering.settings import RenderSettings
 from mrt_mitsuba.sweeps.folder import is_fresh, reserved
-from mrt_mitsuba.sweeps.jobs import check_parameters, jobs, points
+from mrt_mitsuba.sweeps.jobs import jobs, points
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.worker import describe
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from mrt_mitsuba.rendering.settings import RenderOptions
 
 
 def sweep(  # noqa: PLR0913 - each option has a name that editors show
@@ -35,7 +32,7 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
     retries: int = 2,
     resume: bool = True,
     plugins: Any = (),
-    **options: Unpack[RenderOptions],
+    **options: Any,
 ) -> Table:
     """Render every combination of a grid's values on several processes or machines.
 
@@ -85,7 +82,8 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
         fresh = {job.name for job in planned if is_fresh(job, folder, job.file in table.earlier)}
         kept = fresh if resume else set()
         missing = [job for job in planned if job.name not in kept]
-        check_parameters(missing)
+        if missing and "params" in missing[0].arguments:  # all have the same keys; refuses a misspelt one
+            open_with(missing[0].scene, RenderSettings.of(**missing[0].arguments))
         versions = describe(folder)["versions"]
         for job in planned:
             if job.name in kept:

@@ -170,21 +170,21 @@ def test_options_of_a_texture(model, tmp_path, options, uvs, unused):
     assert_allclose(mesh.uvs[mesh.faces[0]], uvs)
 
 
-@pytest.mark.parametrize("texturing", ["report", "standard"])
-def test_a_textured_square(tmp_path, texturing):
-    """Grey above black; values are as stored in the report's texturing, which turns pictures upside down,
+@pytest.mark.parametrize("convention", ["report", "standard"])
+def test_a_textured_square(tmp_path, convention):
+    """Grey above black; values are as stored in the report's convention, which turns pictures upside down,
     and decoded from sRGB in the standard one. Base and gain are of the values looked up, also when exported.
     """
     halves = np.zeros((4, 4, 3), np.uint8)
     halves[:2] = 128
     Image.fromarray(halves).save(tmp_path / "halves.png")
-    row, grey = {"report": (-1, 128 / 255), "standard": (0, 0.21586)}[texturing]
+    row, grey = {"report": (-1, 128 / 255), "standard": (0, 0.21586)}[convention]
     (tmp_path / "a.mtl").write_text("newmtl a\nKs 0 0 0\nmap_Kd -mm 0.1 0.5 halves.png\n")
     (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{WHOLE}usemtl a\nf 1/1 2/2 3/3 4/4\n")
-    view = {"camera": (0.5, 0.5, 2), "target": (0.5, 0.5, 0), "fov": 20, "light": (0.5, 0.5, 9)}
+    view = {"camera": (0.5, 0.5, 2), "target": (0.5, 0.5, 0), "fov": 20}
     options = {"width": 8, "height": 8, "aa": 1, "aamode": "none", "layers": ["albedo"]}
-    written = write_xml(tmp_path / "a.obj", tmp_path / "b.xml", texturing=texturing, **view)
-    for scene, more in ((tmp_path / "a.obj", {**view, "texturing": texturing}), (written[-1], {})):
+    written = write_xml(tmp_path / "a.obj", tmp_path / "b.xml", convention=convention, **view)
+    for scene, more in ((tmp_path / "a.obj", {**view, "convention": convention}), (written[-1], {})):
         column = mrt.render(scene, **options, **more).layers["albedo.R"][:, 4]
         assert_allclose(column[[row, -1 - row]], [0.1 + 0.5 * grey, 0.1], rtol=1e-4)
 
@@ -316,9 +316,8 @@ def test_any_text_is_read_or_refused(model, obj, start, mtl):
 
 def test_view_as_asked_for(tmp_path):
     (path := tmp_path / "a.obj").write_text(SQUARE + "f 1 2 3\n")
-    view = obj_scene(path, camera=(0, 0, 5), fov=30, light=(1, 2, 3), texturing="standard")
+    view = obj_scene(path, camera=(0, 0, 5), fov=30, convention="standard")
     assert view.camera == Camera((0, 0, 5), (0.5, 0.5, 0), hfov=30)
-    assert [light.position for light in view.lights] == [(1, 2, 3)]
     assert view.texturing == "standard"
 
 
