@@ -30,7 +30,7 @@ from mrt_mitsuba.rendering.exposing import FILM_PREFIX
 from mrt_mitsuba.rendering.passes import Passes
 from mrt_mitsuba.rendering.plan import Plan, make_plan
 from mrt_mitsuba.rendering.progress import Job, Progress, Timings, default_progress
-from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.settings import Convention, Lattice, RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import Source, open_scene, sized
 
@@ -131,7 +131,7 @@ def render(  # noqa: PLR0913 - each option has a name that editors show
     denoise: bool = False,
     maxspp: int | None = None,
     maxseconds: float | None = None,
-    lattice: Literal["report", "centered", "film"] | None = None,
+    lattice: Lattice | None = None,
     fresnel: Literal["schlick", "dielectric"] | None = None,
     focaldist: float | None = None,
     focalrange: float | None = None,
@@ -139,7 +139,7 @@ def render(  # noqa: PLR0913 - each option has a name that editors show
     layers: Sequence[str] | str = (),
     motion: Sequence[float] | None = None,
     motionsamples: int = 16,
-    convention: Literal["report", "standard"] = "report",
+    convention: Convention = "report",
     camera: Sequence[float] | None = None,
     up: Sequence[float] | None = None,
     fov: float | None = None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,9 +17,12 @@ from mrt_mitsuba.plugins.whitted.snapshot import SnapshotPart
 from mrt_mitsuba.rendering.api import Result, open_with, refuse_freezing, render_source, session
 from mrt_mitsuba.rendering.exposing import Exposer
 from mrt_mitsuba.rendering.film import Film
-from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering.settings import RenderOptions, RenderSettings
 from mrt_mitsuba.rendering.shading import Shader, camera_matrices
 from mrt_mitsuba.scene.open import opened
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 class Prepared:
@@ -156,7 +159,7 @@ def _window(film: mi.Film) -> tuple[int, ...]:
     return tuple(int(n) for n in (*film.size(), *film.crop_size(), *film.crop_offset()))
 
 
-def prepare(scene: Any = 0, **options: Any) -> Prepared:
+def prepare(scene: Any = 0, **options: Unpack[RenderOptions]) -> Prepared:
     """Read a scene and record its kernels once, for many renders of it; ``options`` are those of ``render``.
 
     .. code-block:: python

@@ -1,16 +1,16 @@
 """The options of ``mrt.render``: ``RenderSettings`` holds and checks them, also for the command, which adds
-its own.
+its own; ``RenderOptions`` has their types for editors.
 
-A new option is a field and a parameter of ``render``.
+A new option is a field, a type in ``RenderOptions`` and a parameter of ``render``.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 from mrt_mitsuba.adaptive.target import METRIC_NAMES, Goal, Target
 from mrt_mitsuba.errors import UsageError
@@ -40,6 +40,8 @@ from mrt_mitsuba.scene.model import CONVENTION, FRESNEL, MODEL_OPTIONS, SIDE, SI
 if TYPE_CHECKING:
     from mrt_mitsuba.adaptive.error import RoundPicture
 
+Convention = Literal["report", "standard"]
+Lattice = Literal["report", "centered", "film"]
 #: The edge detectors as ``aamode`` names them: ``filters.<name>_edges``, and the layers that each reads, in
 #: the order of its arguments; those of the picture can distinguish noise from edges
 DETECTORS = {"luma": ("image",), "sobel": ("image",), "geometry": ("normal", "depth")}
@@ -51,6 +53,42 @@ NOISE = "noise"  # the aamode that allocates samples by variance
 MIN_SPP = 16  # samples per pixel from which the variance is estimated
 MAX_SPP = 4096  # mean samples per pixel, where a target alone would ask for more
 LARGEST_AA = 64  # 4096 samples per pixel; beyond, float32 sums lose more than more samples gain
+
+
+class RenderOptions(TypedDict, total=False):
+    """The options of ``render`` as type checkers see them where a function takes ``**options``."""
+
+    width: int | None
+    height: int | None
+    aa: int | None
+    aamode: Literal["none", "luma", "sobel", "geometry", "noise"] | None
+    target: Target | float | str | Sequence[float] | None
+    metric: Literal["linear", "relative", "display"] | None
+    denoise: bool
+    maxspp: int | None
+    maxseconds: float | None
+    lattice: Lattice | None
+    fresnel: Literal["schlick", "dielectric"] | None
+    focaldist: float | None
+    focalrange: float | None
+    dof: Literal["report", "corrected"]
+    layers: Sequence[str] | str
+    motion: Sequence[float] | None
+    motionsamples: int
+    convention: Convention
+    camera: Sequence[float] | None
+    up: Sequence[float] | None
+    fov: float | None
+    variant: str | None
+    memory: int | str | None
+    seed: int
+    integrator: Any
+    sensor: int
+    on_round: Callable[[RoundPicture], object] | None
+    spp: int | None
+    count_rays: bool
+    params: Mapping[str, Any] | None
+    progress: Progress | None
 
 
 @dataclass(frozen=True, kw_only=True)

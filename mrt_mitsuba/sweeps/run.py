@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import closing
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
@@ -20,6 +20,11 @@ from mrt_mitsuba.sweeps.jobs import jobs, points
 from mrt_mitsuba.sweeps.table import Table
 from mrt_mitsuba.sweeps.worker import describe
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from mrt_mitsuba.rendering.settings import RenderOptions
+
 
 def sweep(  # noqa: PLR0913 - each option has a name that editors show
     scene: Any,
@@ -32,7 +37,7 @@ def sweep(  # noqa: PLR0913 - each option has a name that editors show
     retries: int = 2,
     resume: bool = True,
     plugins: Any = (),
-    **options: Any,
+    **options: Unpack[RenderOptions],
 ) -> Table:
     """Render every combination of a grid's values on several processes or machines.
 

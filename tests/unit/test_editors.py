@@ -9,29 +9,31 @@ import subprocess
 import sys
 from dataclasses import fields
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import jedi
 import pytest
 
 import mrt_mitsuba as mrt
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.rendering.settings import RenderSettings
+from mrt_mitsuba.rendering import settings
+from mrt_mitsuba.rendering.settings import RenderOptions, RenderSettings
 
 ROOT = Path(__file__).parents[2]
 
 
-def test_an_option_is_a_field_and_a_parameter_of_render():
-    """Names and defaults agree, and the names of a choice are those that are taken."""
+def test_an_option_is_a_field_a_type_and_a_parameter_of_render():
+    """Names, order, defaults and types agree, and the names of a choice are those that are taken."""
     taken = dict(inspect.signature(mrt.render).parameters)
     assert taken.pop("scene").default == 0
     held = {field.name: field for field in fields(RenderSettings)}
     assert {name: each.default for name, each in taken.items()} == {n: f.default for n, f in held.items()}
     types = {name: each.annotation for name, each in taken.items()}
+    assert types == {name: each.__forward_arg__ for name, each in RenderOptions.__annotations__.items()}
     for name, annotation in types.items():
         if not annotation.startswith("Literal"):
             continue
-        names = get_args(eval(annotation.removesuffix(" | None"), {"Literal": Literal}))
+        names = get_args(eval(annotation.removesuffix(" | None"), vars(settings)))
         for each in names:
             assert getattr(RenderSettings(**{name: each}), name) == each
         with pytest.raises(UsageError) as refused:
@@ -91,7 +93,10 @@ result.image, result.error
 mrt.render(3, widht=64)  # wrong
 mrt.render(3, aamode="sobal")  # wrong
 mrt.prepare(3, width=64, aamode="noise")(seed=1).save("a.exr")
+mrt.prepare(3, widht=64)  # wrong
 mrt.sweep(3, "out", grid={"aa": [1]}, aamode="sobel")
+mrt.sweep(3, "out", gird={"aa": [1]})  # wrong
+mrt.sweep(3, "out", aamode="sobal")  # wrong
 mrt.check_bsdf({"type": "diffuse"}, quick=True).passed
 mrt.check_shape({"type": "sphere"}, qiuck=True)  # wrong
 mrt.error_vs_time(3, {}, reference={}, repaets=5)  # wrong
