@@ -407,9 +407,7 @@ MISTAKES: dict[str, Mistake] = {
         "surface.on_ray surface.near_by surface.again surface.missed", ray_intersect=below
     ),
     # differences of hit points suffer as well
-    "shape: digits lost": shape_with(
-        "surface.behind surface.noise normals.slope normals.step", ray_intersect=rounded
-    ),
+    "shape: digits lost": shape_with("surface.behind normals.slope normals.step", ray_intersect=rounded),
     "sky: none": sky_with(""),
     "sky: seen 0.99 times as bright": sky_with("weights.seen", seen=darker),
     "sky: half of it": sky_with("sampling.small sampling.slices", direction=upwards),

@@ -243,7 +243,6 @@ def no_density_of_sample(size, ds, u):
 
 
 @finds("small", "no samples in a cone, in degrees", 3, direction=around_hole)
-@finds("small", "samples without weight in a cone, in degrees", 3, weight=nothing_in_hole)
 @finds(
     "dark",
     "no density in a cone, in degrees",

@@ -68,24 +68,21 @@ def steps_away(x: Array, count: Array) -> Array:
 def measure(
     function: Function,
     inputs: Array,
+    project: Function,
     *,
-    size: Array | None = None,
-    strides: Sequence[int] = STRIDES,
     seed: int = 0,
-    project: Function | None = None,
 ) -> Lanes:
     """Estimate the noise of ``function([M, K]) -> [M]`` at float32 inputs [N, K].
 
-    The result has the ``noise`` in roundings (2⁻²⁴) of the value, or of ``size`` [N]; the noise over what
-    inputs, rounded twice, and ``ALLOWANCE`` other roundings explain (``lost``); and the ``stride`` of each
-    line.
+    The result has the ``noise`` in roundings (2⁻²⁴) of the value; the noise over what inputs, rounded
+    twice, and ``ALLOWANCE`` other roundings explain (``lost``); and the ``stride`` of each line.
 
-    ``strides``: the most float32 steps between points of a line, ascending; the first counts along which the
-    value changes at half of them, since lost digits leave stairs, flat where a line is short. ``project``
-    makes inputs far from the first valid again; with it, ``COARSE`` lines are examined as well. Stairs are as
-    high at any step that is large compared with them, unlike kinks and what is left of a smooth function:
-    only noise whose ratio at two steps is at most ``MAX_NOISE_RATIO`` counts. Nine in ten lines are shorter
-    than a step of a table that is read by the nearest of a thousand entries: that is no rounding error.
+    The first of ``STRIDES`` counts along which the value changes at half of the points, since lost digits
+    leave stairs, flat where a line is short. ``COARSE`` lines are examined as well; ``project`` makes inputs
+    so far from the first valid again. Stairs are as high at any step that is large compared with them,
+    unlike kinks and what is left of a smooth function: only noise whose ratio at two steps is at most
+    ``MAX_NOISE_RATIO`` counts. Nine in ten lines are shorter than a step of a table that is read by the
+    nearest of a thousand entries: that is no rounding error.
     """
     inputs = np.float32(inputs)
     rng = np.random.default_rng(seed)
@@ -101,23 +98,22 @@ def measure(
         ways = np.array([rng.integers(-s, s + 1, inputs.shape) for s in strides])
         return np.arange(POINTS)[:, None, None] * ways[:, None]
 
-    lines = values(along(strides))
+    lines = values(along(STRIDES))
     flat = (np.diff(lines, axis=1) == 0).mean(axis=1) > 0.5
-    chosen = np.where(flat.all(axis=0), len(strides) - 1, flat.argmin(axis=0))
+    chosen = np.where(flat.all(axis=0), len(STRIDES) - 1, flat.argmin(axis=0))
     line = np.take_along_axis(lines, chosen[None, None], axis=0)[0]
     slope = _slope(values, inputs.shape)
     explained = np.sqrt((slope**2).sum(axis=0) / 12)  # a rounded input is within half a step: variance 1/12
-    unit = ROUNDING * abs(line[0] if size is None else size)
+    unit = ROUNDING * abs(line[0])
     noise = ecnoise(line)
-    if project:
-        stairs = np.array([ecnoise(line, coarse=True) for line in values(along(COARSE), project)])
-        small = np.minimum(stairs[:-1], stairs[1:])
-        large = np.maximum(stairs[:-1], stairs[1:])
-        alike = (large <= MAX_NOISE_RATIO * small) & (small > MIN_STAIRS * unit)
-        both = np.where(alike, small, 0).max(axis=0)
-        noise = np.where(np.nan_to_num(noise) < both, both, noise)
+    stairs = np.array([ecnoise(line, coarse=True) for line in values(along(COARSE), project)])
+    small = np.minimum(stairs[:-1], stairs[1:])
+    large = np.maximum(stairs[:-1], stairs[1:])
+    alike = (large <= MAX_NOISE_RATIO * small) & (small > MIN_STAIRS * unit)
+    both = np.where(alike, small, 0).max(axis=0)
+    noise = np.where(np.nan_to_num(noise) < both, both, noise)
     lost = np.nan_to_num(noise / unit / np.hypot(2 * explained / unit, ALLOWANCE), posinf=0)
-    return Lanes(noise=noise / unit, lost=lost, stride=np.take(strides, chosen))
+    return Lanes(noise=noise / unit, lost=lost, stride=np.take(STRIDES, chosen))
 
 
 def _slope(values: Function, shape: tuple[int, ...]) -> Array:

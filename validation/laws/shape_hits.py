@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -12,9 +11,8 @@ import numpy as np
 from numpy.linalg import norm
 from scipy import stats
 
-from . import noise, plots
 from .case import READS, READS_WHY, WAVE, class_name, reads_checked
-from .faults import PLACE, SIZE, larger, member, off_surface, put, tilted
+from .faults import SIZE, larger, member, off_surface, put, tilted
 from .law import (
     MIN_QUANTILE_ERRORS,
     SIGNIFICANCE,
@@ -153,23 +151,14 @@ def close(size, si, ray):
         "no absolute limits; outlines hang on roundings",
         RAY,
     ),
-    noise=Criterion(
-        0.9,
-        f"rounding noise of the {{what}} over that of {noise.ALLOWANCE:g} roundings and of a rounded ray, "
-        "90th percentile",
-        noise.MAX_NOISE,
-        "digits are lost inside that could be kept",
-        RAY,
-    ),
 )
 def surface(law: Outcome, case: ShapeCase) -> None:
-    """Hits lie on the ray and the surface; spawned rays do not meet it where they start; digits are kept."""
+    """Hits lie on the ray and the surface; spawned rays do not meet it where they start."""
     met = case.met
     largest = abs(np.column_stack([met.o, met.p])).max(axis=1) + met.t
     law.check("on_ray", _off_ray(met) / (ROUNDING * largest), met)
     _from_near_by(law, case)
     _again(law, case)
-    _noise(law, case)
 
 
 def _off_ray(hits: Lanes) -> Array:
@@ -188,23 +177,6 @@ def _again(law: Outcome, case: ShapeCase) -> None:
     alike = abs(dot(again.n, few.n)) > np.where(again.part == few.part, 0.9, 0.9999)
     bad = again.met & near(few.p, again.p) & (abs(dot(few.n, away)) > GRAZING_COSINE)
     law.check("again", bad, again, where=alike, count=count)
-
-
-def _noise(law: Outcome, case: ShapeCase) -> None:
-    """The noise of distance, hit point and normal."""
-    met = case.few(case.met, 300, 1000)
-    scale = abs(met.o).max(axis=1) + met.t
-    inputs = np.column_stack([met.o, met.d])
-
-    def number(which: int, x: Array) -> Array:
-        hits = trace(case.target, x[:, :3], x[:, 3:])
-        return (hits.t, hits.p.sum(axis=1), hits.n @ (0.6, 0.48, 0.64))[which]
-
-    sizes = {"distance": scale, "hit point": scale, "normal": np.ones_like(scale)}
-    for which, (what, size) in enumerate(sizes.items()):
-        quantity = partial(number, which)
-        estimate = noise.measure(quantity, inputs, size=size, strides=(64,), seed=case.seed)
-        law.check("noise", estimate.lost, met, what=what)
 
 
 def _from_near_by(law: Outcome, case: ShapeCase) -> None:
@@ -306,9 +278,6 @@ def normals(law: Outcome, case: ShapeCase) -> None:
     if same.sum() > MIN_QUANTILE_ERRORS:
         law.check("turned", dot(back.n, met.n) < -0.5, met, where=same)
     _differences(law, case)
-    if not law.holds:
-        towards = met[met.d @ PLACE < -0.5]
-        law.plot = partial(plots.normals, towards.p, towards.n, towards.shading)
 
 
 def _differences(law: Outcome, case: ShapeCase) -> None:
