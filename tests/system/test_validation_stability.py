@@ -19,7 +19,7 @@ def test_every_case_holds():
     whole = findings(stability.run, quick=True)
     assert whole.missed == set()
     assert len(whole.bounds) > 30
-    assert [*whole.tables] == ["roundings", "far"]
+    assert [*whole.tables] == ["roundings"]
 
 
 HIGHLIGHT = "value of a highlight along the roughness α"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.linalg import norm
@@ -12,19 +11,15 @@ from numpy.linalg import norm
 from mrt_mitsuba.rendering.api import render
 from mrt_mitsuba.scene.model import Camera, Light, Material, Plane, Scene, Sphere
 from mrt_mitsuba.scene.report import report_scene
-from mrt_mitsuba.validation.laws.bsdf import check_bsdf
 from mrt_mitsuba.validation.oracles.reference import reference_render, unit
 from mrt_mitsuba.validation.studies.stability import axes
 from mrt_mitsuba.validation.study import Study, Values
 
 # ----------------------------------------------- Reflectance -----------------------------------------------
 
-EXTREME = (0.0, 1e-8, 1e-3, 1.0, 100.0, -0.4)  # roughnesses
-IORS = (1 + 1e-7, 1e-3)
-
 
 def reflectance(study: Study, *, quick: bool) -> None:
-    """Hold F where total reflection begins, and values at extreme roughnesses."""
+    """Hold F where total reflection begins."""
     # there F ends in a square root: errors are those of g = 0
     iors = np.repeat(np.array([0.5, 0.9, 0.99, 0.9999], np.float32), 81)
     critical = np.sqrt(1 - np.float64(iors) ** 2)
@@ -32,13 +27,6 @@ def reflectance(study: Study, *, quick: bool) -> None:
     why = "√ of a rounding: 1 - F is 4 g / (η² cos θ) there, and g² is known to a rounding of cos²"
     error = axes.reflectances(cosines, iors)[axes.OURS].max() * axes.ROUNDING
     study.at_most("error of F within 40 float32 cosines of the critical angle", error, 16 * 2.0**-12, why)
-    for alpha in EXTREME:
-        bsdfs = [
-            {"type": "mrt_bsdf", "fresnel": "dielectric", "alpha": alpha, "int_ior": float(n)} for n in IORS
-        ]
-        failed = sum(len(check_bsdf(bsdf, quick=True, only=["finite"]).failed) for bsdf in bsdfs)
-        why = "indices 1 + 1e-7 and 1e-3: no value is NaN, infinite or negative"
-        study.at_most(f"laws of finite values that fail, alpha {alpha:g}", failed, 0, why)
 
 
 # ---------------------------------------------- Light paths ----------------------------------------------
@@ -57,10 +45,6 @@ LIGHTS = (Light((2, 3, 4), (1.0, 0.9, 0.8)), Light((-3, 2, 2), (0.4, 0.5, 0.6)))
 FLOOR = Plane((0, 1, 0), 0.0, GREY)
 BALL = Sphere((0, 0.5, 0), 0.5, GREY)
 BASE = Scene(CAMERA, (0.2, 0.3, 0.4), LIGHTS, (BALL,), (FLOOR,))
-
-
-def _ball(**changes: Any) -> Scene:
-    return replace(BASE, spheres=(replace(BALL, material=replace(GREY, **changes)),))
 
 
 def _lit(position: tuple[float, float, float], color: float = 1.0) -> Scene:
@@ -88,8 +72,6 @@ def light_paths(study: Study, *, quick: bool) -> None:
         ("a light of 1e4, without clamp", bright, PLAIN, unclamped),
         ("a light inside a ball, not lit from outside", _lit((0, 0.5, 0)), PLAIN, {}),
         ("a light at 1e6, parallel light", _lit((4e5, 6e5, 7e5)), PLAIN, {}),
-        ("black, Kd = Ks = 0", _ball(specular=(0,) * 3, diffuse=(0,) * 3), 3e-7, {}),
-        ("alpha -0.4, no diffuse part", _ball(alpha=-0.4, diffuse=(0, 0, 0)), 5e-6, unclamped),
     ]
     why = "roundings, relative to the value plus a thousandth, of 95 % of the pixels"
     for name, scene, limit, settings in study.each("Light paths", rows):
@@ -122,22 +104,17 @@ SHARE_MOVED = 1e-4
 def placements(study: Study, *, quick: bool) -> None:
     """Hold the share of pixels that change where the report's scenes are scaled, or moved by their sizes."""
     what = "share of pixels off by more than 2/255"
-    rows: list[Values] = []
     # Scene 2 shows the horizon, which a far plane can cut off
     for number in study.each("Placements", (0, 2) if quick else range(5)):
         scene = replace(report_scene(number), focal_distance=None)
         for factor in (1e-6, 1e-3, 1e3, 1e6):
             off = changed(scene, factor, 0)
             study.at_most(f"{what}: scene {number} times {factor:g}", off, SHARE_SCALED, "the same picture")
-        for sizes in (1.0, 10.0, 100.0, 1e3, 1e4):
+        for sizes in (1.0, 10.0, 100.0):
             off = changed(scene, 1, sizes)
-            if sizes > 100:
-                rows.append({"scene": number, "moved by its size times": sizes, what: off})
-                continue
             most = max(SHARE_MOVED * sizes, SHARE_SCALED)
             why = "coordinates have steps of 2⁻²³ of that distance: normals and outlines move"
             study.at_most(f"{what}: scene {number} moved by {sizes:g} sizes", off, most, why)
-    study.records("far", "Moved so far that float32 has no digits left: nothing can be promised", rows)
 
 
 def changed(scene: Scene, factor: float, sizes: float) -> float:
