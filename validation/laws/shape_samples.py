@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.linalg import norm
 from scipy import stats
-from scipy.linalg import null_space
 
 from .faults import larger, member, off_surface, put, smaller, tilted
 from .law import (
@@ -222,26 +219,20 @@ def _area(law: Outcome, case: ShapeCase, s: Lanes, area: float) -> None:
     law.check("crossings", beyond / area, limit=room)
     # crossings of a line come together
     size = 1 / (1 / len(s.p) + (crossed**2).sum() / crossed.sum() / len(crossings))
-    both = s.p - case.middle, crossings - case.middle
-    law.check("spread", _chance([(*both, axis) for axis in case.units(AXES)], size))
+    law.check("spread", _chance(s.p, crossings, case.units(AXES), size))
 
 
-AXES = 8  # aslant, along which positions are compared
+AXES = 8  # aslant, along which positions and directions are compared
 GRAZING_ALLOWANCE = 2e-3  # lines that graze are left room for
 VIEWS = 3  # from which directions are compared
 
 
-def _chance(pairs: Sequence[tuple[Array, Array, Array]], size: float) -> float:
-    """The chance that pairs of sets of vectors are so different along an axis and around it.
+def _chance(v: Array, w: Array, axes: Array, size: float) -> float:
+    """The chance that sets of vectors [N, 3] and [M, 3] are so different along one of the axes [A, 3].
 
-    [N, 3], [M, 3] and [3] each. By Kolmogorov and Smirnov's test, for samples of an effective ``size``.
+    By Kolmogorov and Smirnov's test, for samples of an effective ``size``.
     """
-    apart = []
-    for v, w, axis in pairs:
-        across = null_space(axis[None])
-        apart.append(stats.ks_2samp(v @ axis, w @ axis, method="asymp").statistic)
-        azimuths = [np.arctan2(*(x @ across).T) for x in (v, w)]
-        apart.append(stats.ks_2samp(*azimuths, method="asymp").statistic)
+    apart = [stats.ks_2samp(v @ axis, w @ axis, method="asymp").statistic for axis in axes]
     beyond = max(max(apart) - GRAZING_ALLOWANCE, 0)
     return sidak(stats.kstwobign.sf(np.sqrt(size) * beyond), len(apart))
 
@@ -296,7 +287,7 @@ def _aim(law: Outcome, case: ShapeCase) -> None:
         uniform = away[within]
         if min(len(even), len(uniform)) > count // 32:  # else it is seen edge on
             size = 1 / (1 / len(even) + 1 / len(uniform))
-            chances.append(_chance([(even, uniform, unit(case.middle - place))], size))
+            chances.append(_chance(even, uniform, case.units(AXES), size))
     law.check("angle", angles)
     if chances:
         law.check("aim", sidak(min(chances), len(chances)))
