@@ -179,8 +179,9 @@ def _interrupted(run: Callable[[], object], calls: int) -> None:
     sys.setprofile(count)
     try:
         run()
-    except KeyboardInterrupt:
-        pass
+    except (KeyboardInterrupt, RuntimeError) as error:  # which Mitsuba's loader makes of it
+        if "KeyboardInterrupt" not in repr(error):
+            raise
     finally:
         sys.setprofile(None)
 

@@ -13,9 +13,7 @@ from mrt_mitsuba.command.registry import import_plugins
 from mrt_mitsuba.errors import MrtWarning, printable
 from mrt_mitsuba.files.replacing import check_target
 from mrt_mitsuba.interrupts import defer_signals
-from mrt_mitsuba.options import is_obj
-from mrt_mitsuba.rendering.settings import AA, AAMODE, NOISE
-from mrt_mitsuba.scene.model import FOCAL_RANGE, SIZE
+from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
 
 
 def run(options: Options) -> int:
@@ -28,12 +26,8 @@ def run(options: Options) -> int:
     if spared:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         gc.disable()
-    from mrt_mitsuba.rendering.progress import Progress, TerminalProgress
-
     if options.quiet:
         warnings.simplefilter("ignore", MrtWarning)
-    else:
-        print(banner(options), flush=True)
     with defer_signals():
         from mrt_mitsuba import runtime
 
@@ -58,25 +52,3 @@ def run(options: Options) -> int:
         print(f"Wrote {printable(' and '.join(options.outputs()))}")
         print(f"Render time: {seconds:.6f}s")
     return 0
-
-
-def banner(options: Options) -> str:
-    """Return the parameters of the render, one per line."""
-    distance, reach = options.focus(None, FOCAL_RANGE)
-    if isinstance(options.scene, int):
-        from mrt_mitsuba.scene.report import report_scene
-
-        scene = report_scene(options.scene)
-        distance, reach = options.focus(scene.focal_distance, scene.focal_range)
-    film = "from the file" if options.inputs() and not is_obj(options.scene, {}) else ""
-    aamode = options.aamode or (NOISE if options.error else None)
-    lines = {
-        "Scene": printable(str(options.scene)),
-        "Width": options.width or film or SIZE[0],
-        "Height": options.height or film or SIZE[1],
-        "AA": options.aa or ("as noise needs" if aamode == NOISE else film or AA),
-        "AA mode": aamode or film or AAMODE,
-        "F distance": distance or "off",
-        "F range": reach if distance else "off",
-    }
-    return "\n".join(f"{name + ':':<12}{value}" for name, value in lines.items())

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import mitsuba as mi
 
 from mrt_mitsuba.adaptive.target import Goal
-from mrt_mitsuba.errors import UsageError, needs_extra
+from mrt_mitsuba.errors import UsageError, needs_extra, printable
 from mrt_mitsuba.files.layers import DERIVED, FIRST_HIT, LAYERS, TABLE
 from mrt_mitsuba.options import either
 from mrt_mitsuba.plugins.variants import is_jit
@@ -191,6 +191,20 @@ class Plan:
         further = () if left_out is None else (left_out,)
         return replace(self, passes=tuple(steps), left_out=(*self.left_out, *further))
 
+    def parameters(self) -> str:
+        """Return the parameters of the render, one per line, as the original program prints them."""
+        distance = self.options["focaldist"]
+        lines = {
+            "Scene": printable(self.scene),
+            "Width": self.width,
+            "Height": self.height,
+            "AA": self.options["aa"],
+            "AA mode": self.options["aamode"],
+            "F distance": distance or "off",
+            "F range": self.options["focalrange"] if distance else "off",
+        }
+        return "\n".join(f"{name + ':':<12}{value}" for name, value in lines.items())
+
     def __repr__(self) -> str:
         lines = [f"Plan for {self.scene}, {self.width}x{self.height}, {self.integrator} in {self.variant}"]
         if self.time_strata:
@@ -272,7 +286,7 @@ def _decided(settings: RenderSettings, goal: Goal | None, source: Source, shader
         spp = min(goal.max_spp, MOST_SPP)
     elif settings.spp is None and source.own and plain and settings.aamode is None:
         spp = shader.film.rays
-    distance, reach = settings.focus(source.focal_distance, source.focal_range)
+    distance = source.focal_distance if settings.focaldist is None else settings.focaldist
     return replace(
         settings,
         aa=settings.aa or (1 if one else AA),
@@ -280,7 +294,7 @@ def _decided(settings: RenderSettings, goal: Goal | None, source: Source, shader
         lattice=settings.lattice or (FILM if source.own or whole or goal else "report"),
         spp=spp,
         focaldist=distance or 0.0,
-        focalrange=reach,
+        focalrange=source.focal_range if settings.focalrange is None else settings.focalrange,
     )
 
 

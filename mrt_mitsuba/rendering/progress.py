@@ -45,8 +45,8 @@ class Progress:
 class TerminalProgress(Progress):
     """Print messages, and a bar on standard error if that is a terminal, or in a notebook.
 
-    ``show_plan``, ``messages``: whether to print the render plan, and messages. Bars count in ``unit``, for
-    stages that take longer than ``delay`` seconds.
+    ``show_plan``, ``messages``: whether to print the render plan, and the parameters of the render and
+    messages. Bars count in ``unit``, for stages that take longer than ``delay`` seconds.
     """
 
     show_plan: bool = False
@@ -54,7 +54,9 @@ class TerminalProgress(Progress):
     delay: float = 0.0
     unit: str = "px"
 
-    def plan(self, plan: object) -> None:
+    def plan(self, plan: Any) -> None:  # a ``Plan``
+        if self.messages:
+            print(plan.parameters(), flush=True)
         if self.show_plan:
             print(plan, flush=True)
 

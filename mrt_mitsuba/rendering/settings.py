@@ -242,17 +242,6 @@ class RenderSettings:
         given = {name: getattr(self, name) for name in names}
         return {name: value for name, value in given.items() if value is not None}
 
-    def focus(self, distance: float | None, reach: float) -> tuple[float | None, float]:
-        """Return the focal distance, None for no depth of field, and half of the sharp range, in scene units.
-
-        ``distance`` and ``reach``: the scene's defaults.
-        """
-        if self.focaldist is not None:
-            distance = self.focaldist
-        if self.focalrange is not None:
-            reach = self.focalrange
-        return distance or None, reach
-
 
 #: The options of a render by name, without those that only Python can give
 TABLE = table(RenderSettings)
