@@ -64,10 +64,11 @@ class AxialMesh(mi.Mesh):
         """Return the unit frame with its derivatives; None where none are wanted."""
         return self._frame() if dr.grad_enabled(list(self.parameters.values())) else None
 
-    def snapshot_state(self) -> tuple[list, list, list]:
-        """Return the state that a snapshot compares instead of all attributes: values, objects, arrays."""
-        arrays = [*self.parameters.values(), self.vertex_positions_buffer(), self.faces_buffer()]
-        return [self.kind], [self.table, self.placement], arrays
+    def snapshot_state(self) -> tuple[object, list]:
+        """Return what a snapshot compares instead of all attributes: an object that each change of the
+        parameters makes anew, and arrays.
+        """
+        return self.table, [*self.parameters.values(), self.vertex_positions_buffer(), self.faces_buffer()]
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         mi.Mesh.traverse(self, callback)
@@ -87,7 +88,6 @@ class AxialMesh(mi.Mesh):
 
     def _follow(self, frame: Frame) -> None:
         """Write positions and normals anew, with derivatives by the parameters of ``frame``."""
-        frame = Frame(*map(mi.Vector3f, vars(frame).values()))
         vertices, _ = self.unit
         points = mi.Vector3f(vertices[:, :3].T)
         gradients = mi.Vector3f(vertices[:, 3:6].T)

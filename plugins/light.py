@@ -80,7 +80,7 @@ class MrtLight(mi.Emitter):
         self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         ds = towards(self.position, it)
-        ds.emitter = pointer("Emitter", self)
+        ds.emitter = pointer(self)
         return ds, mi.depolarizer(self._irradiance(it, active))
 
     def pdf_direction(

@@ -48,21 +48,20 @@ class Placement:
                 f'{props.plugin_name()}: "to_world" is not invertible; remove its zero scale'
             )
         self.mirrors = bool(determinant < 0)
-        self.linear = linear.tolist()
-        self.inverse = np.linalg.inv(linear).tolist()
-        self.offset = matrix[:3, 3].tolist()
+        self.matrix = matrix[:3]  # [3, 4]
+        self.inverse = np.linalg.inv(linear)
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """Return the places of points [n, 3]."""
-        return points @ np.transpose(self.linear) + np.array(self.offset)
+        return points @ self.matrix[:, :3].T + self.matrix[:, 3]
 
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame of the moved shape; works for vectors of any type."""
 
-        def row(v):
-            return type(v)([sum(v[i] * self.inverse[i][j] for i in range(3)) for j in range(3)])
+        def times(matrix, v, numbers):
+            rows = matrix.tolist()
+            return type(v)([sum(c * m for c, m in zip(numbers, row, strict=True)) for row in rows])
 
         o = frame.origin
-        rows = zip(self.linear, self.offset, strict=True)
-        origin = [sum(m * c for m, c in zip(line, o, strict=True)) + shift for line, shift in rows]
-        return Frame(type(o)(origin), row(frame.x), row(frame.y), row(frame.z))
+        axes = (times(self.inverse.T, v, v) for v in (frame.x, frame.y, frame.z))
+        return Frame(times(self.matrix, o, [*o, 1]), *axes)

@@ -67,10 +67,9 @@ class Sphere:
         q = frame.point(p)
         make = type(q)
         r = dr.norm(q)
-        at_center = r == 0
-        gradient = q * (1 / dr.select(at_center, 1, r))
+        gradient = q * (1 / r)
         g = frame.gradient(gradient)
-        inverse = 1 / dr.select(at_center, 1, dr.norm(g))
+        inverse = 1 / dr.norm(g)
         n = g * inverse
         v = dr.acos(dr.clip(gradient.z, -1, 1)) / dr.pi
         across, x, y = _polar(q)

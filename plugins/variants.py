@@ -17,9 +17,9 @@ def is_jit() -> bool:
     return not mi.variant().startswith("scalar")
 
 
-def pointer(kind: str, objects: list[mi.Emitter] | mi.Emitter) -> mi.EmitterPtr:
-    """Return an array of pointers to objects (``kind`` "Shape", ...); in scalar variants, the objects."""
-    return getattr(mi, kind + "Ptr")(objects) if is_jit() else objects
+def pointer(emitters: list[mi.Emitter] | mi.Emitter) -> mi.EmitterPtr:
+    """Return an array of pointers to emitters; in scalar variants, the emitters."""
+    return mi.EmitterPtr(emitters) if is_jit() else emitters
 
 
 def first(value: mi.Float) -> float:

@@ -48,7 +48,7 @@ class Lights:
         self.count = dr.opaque(mi.UInt32, len(lights)) if form in ("loop", "table") else None
         self.called: Any = lights if rows is None else None
         if form == "loop":
-            self.called = pointer("Emitter", lights)
+            self.called = pointer(lights)
         elif form == "table" and rows is not None:
             self.table = Table(mi.Vector3f, rows)
         elif rows is not None:

@@ -254,12 +254,9 @@ def _buffers(facts: SceneFacts, decisions: Decisions) -> Decisions:
 def contents(plan: KernelPlan, facts: SceneFacts) -> list[str]:
     """Return a line for each thing that the kernels hold."""
     quadrics = sum(count for kind, count in facts.quadrics if kind in plan.quadrics)
-    spheres = {"table": "spheres from a table of centres and radii", "corrected": "hits moved onto spheres"}
-    ways = {"unrolled": "unrolled", "loop": "in a loop of calls", "table": "in a loop over a table"}
-    skies = {"parameter": "the integrator's sky", "environment": "the scene's sky"}
     lines = {
-        spheres.get(plan.spheres, ""): plan.spheres != "none",
-        f"{facts.lights} lights, {ways.get(plan.lights)}": plan.lights != "none",
+        f"{facts.spheres} spheres: {plan.spheres}": plan.spheres != "none",
+        f"{facts.lights} lights: {plan.lights}": plan.lights != "none",
         "mirror bounces": plan.mirrors,
         f"lobes: {', '.join(plan.lobes)}": bool(plan.lobes),
         "an end of paths too dim to be seen": 0 < plan.contribution_bounds[0] < math.inf,
@@ -269,7 +266,7 @@ def contents(plan: KernelPlan, facts: SceneFacts) -> list[str]:
         f"{facts.planes} analytic planes": plan.planes,
         "light buffers: candidate occluders of each light": plan.light_buffers,
         "camera buffer: candidate hits of camera rays": plan.eye_buffer,
-        skies.get(plan.sky, ""): plan.sky != "none",
+        f"sky: {plan.sky}": plan.sky != "none",
         "tangents along texture coordinates": plan.tangents,
         "all materials as one, from a table": plan.merged,
     }

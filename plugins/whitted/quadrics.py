@@ -116,7 +116,7 @@ class Quadrics:
             return scale
         frame, kind, size, side = self._row(leaf, where)
         for number, moving in self.moving:
-            rows = zip((moving.origin, moving.x, moving.y, moving.z), vars(frame).values(), strict=True)
+            rows = zip(vars(moving).values(), vars(frame).values(), strict=True)
             frame = Frame(*(dr.select(leaf == number, mi.Vector3f(a), mi.Vector3f(b)) for a, b in rows))
         if self.moving:
             # The hit goes along the ray as the surface moves

@@ -44,17 +44,6 @@ class Hit:
     error: mi.Float  # how far the point may be off the surface
 
 
-@dataclass
-class Traced:
-    """The shapes of a scene by who traces them."""
-
-    bvh: mi.Scene | None  # of shapes that only Mitsuba can trace; None where that is the scene itself
-    planes: Planes
-    quadrics: Quadrics | None
-    errors: HitErrors
-    spheres: Spheres | None
-
-
 class SceneData:
     """The data of the kernels for a scene, as a plan wants them, and its ray queries.
 
@@ -71,26 +60,25 @@ class SceneData:
         self._shape_key = now.shape_part, plan.bvh, plan.planes, plan.quadrics, plan.spheres
         self._comparable = now.material_part.comparable and now.light_part.comparable
         traced = cache("traced", self._shape_key, _trace, reading, plan)
-        self.bvh = traced.bvh or scene
-        self.planes = traced.planes
-        self.quadrics = traced.quadrics
-        self.errors = traced.errors
-        self.spheres = traced.spheres
+        bvh, self.planes, self.quadrics, self.errors, self.spheres = traced
+        self.bvh = bvh or scene
         self.lights = cache(
             "lights", (now.light_part, plan.lights), Lights, reading.lights, reading.light_rows, plan.lights
         )
-        things = [thing for thing in (traced.quadrics, traced.spheres) if thing is not None]
+        things = [thing for thing in (self.quadrics, self.spheres) if thing is not None]
         blockers = things if plan.light_buffers else []
         light_key = now.light_part, plan.light_buffers, *self._shape_key
         places = [row[0] for row in reading.light_rows or ()]
         #: lists of the objects that may block each light, with the objects, which test rays
         self.light_buffers = cache("light buffers", light_key, _buffers, places, blockers)
-        seen = [traced.quadrics] if plan.eye_buffer and traced.quadrics is not None else []
+        seen = [self.quadrics] if plan.eye_buffer and self.quadrics is not None else []
         eye_key = now.eye, plan.eye_buffer, *self._shape_key
         #: the same of the quadrics that the camera may see
         self.eye_buffers = cache("eye buffers", eye_key, _buffers, [now.eye], seen)
-        material_key = now.shape_part, now.material_part, plan.merged
-        self.merged = cache("merged", material_key, _material_table, reading, plan)
+        self.merged: MaterialTable | None = None
+        if plan.merged:
+            material_key = now.shape_part, now.material_part
+            self.merged = cache("merged", material_key, MaterialTable, now.shapes, reading.materials)
         #: of what a path may still bring, as data: a brighter sky needs no new kernel
         self.path_bound = plan.contribution_bounds[0]
         if is_jit() and self.path_bound < dr.inf:
@@ -145,7 +133,10 @@ class SceneData:
             on_plane = and_not(on_plane, found)
             scale = self.planes.fill_interaction(si, ray, plane, on_plane, scale, tangents=plan.tangents)
             found = found | on_plane
-        si.sh_frame = _frame_along(si) if plan.tangents else mi.Frame3f(si.sh_frame.n)
+        if plan.tangents:
+            si.initialize_sh_frame()
+        else:
+            si.sh_frame = mi.Frame3f(si.sh_frame.n)
         si.wi = si.to_local(-ray.d)
         si.time = ray.time
         si.wavelengths = ray.wavelengths
@@ -220,8 +211,14 @@ def context_of(lobes: Sequence[str]) -> mi.BSDFContext:
     return context
 
 
-def _trace(reading: Reading, plan: KernelPlan) -> Traced:
-    """Sort the shapes by who traces them."""
+def _trace(
+    reading: Reading, plan: KernelPlan
+) -> tuple[mi.Scene | None, Planes, Quadrics | None, HitErrors, Spheres | None]:
+    """Sort the shapes by who traces them.
+
+    Returns a scene of those that only Mitsuba can trace, None where that is the scene itself; the planes and
+    the quadrics; and, of Mitsuba's shapes, the errors of hits and the spheres.
+    """
     exact = [s for s in reading.quadrics if s.table.kind in plan.quadrics]
     planes = reading.planes if plan.planes else []
     own = {id(s) for s in (*exact, *planes)}
@@ -244,7 +241,7 @@ def _trace(reading: Reading, plan: KernelPlan) -> Traced:
         from .quadrics import Quadrics  # only for scenes that have some
 
         quadrics = Quadrics(exact)
-    return Traced(bvh, Planes(planes), quadrics, HitErrors(others), spheres)
+    return bvh, Planes(planes), quadrics, HitErrors(others), spheres
 
 
 def _buffers(
@@ -256,21 +253,6 @@ def _buffers(
     from .buffers import PointBuffer  # only for scenes that have some
 
     return [(PointBuffer(np.array(places), *thing.boxes()), thing) for thing in things]
-
-
-def _material_table(reading: Reading, plan: KernelPlan) -> MaterialTable | None:
-    return MaterialTable(reading.snapshot.shapes, reading.materials) if plan.merged else None
-
-
-def _frame_along(si: mi.SurfaceInteraction3f) -> mi.Frame3f:
-    """Return the shading frame whose s is along dp/du; any frame where that is nothing, as at an apex."""
-    n = si.sh_frame.n
-    s = si.dp_du - n * dr.dot(n, si.dp_du)
-    length = dr.norm(s)
-    known = length > 1e-4 * dr.norm(si.dp_du)
-    s = s / dr.select(known, length, 1)
-    any_frame = mi.Frame3f(n)
-    return mi.Frame3f(dr.select(known, s, any_frame.s), dr.select(known, dr.cross(n, s), any_frame.t), n)
 
 
 def _eval_bsdf(

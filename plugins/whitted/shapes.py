@@ -36,14 +36,12 @@ class Planes:
         """Return the distance of the nearest plane, or ``ray.maxt``, its number, and if there is one."""
         t = mi.Float(ray.maxt)
         index = mi.UInt32(0)
-        hit = mi.Bool(False)
         for k, (normal, distance) in enumerate(self.equations):
             t_plane = intersect_plane(ray.o, ray.d, normal, distance)
             closer = active & (t_plane < t)
             t = dr.select(closer, t_plane, t)
             index = dr.select(closer, mi.UInt32(k), index)
-            hit = hit | closer
-        return t, index, hit
+        return t, index, t < ray.maxt
 
     def separate(self, p: mi.Point3f, q: mi.Point3f) -> mi.Bool:
         """True if there is a plane between two points."""
@@ -171,7 +169,5 @@ def center_and_radius(shape: mi.Shape) -> list[float]:
     """Return centre and radius of a sphere, zeros for another shape."""
     if not is_sphere(shape):
         return [0.0] * 4
-    low = [float(c) for c in shape.bbox().min]
-    high = [float(c) for c in shape.bbox().max]
-    center = [0.5 * (a + b) for a, b in zip(low, high, strict=True)]
-    return [*center, 0.5 * (high[0] - low[0])]
+    low, high = np.array([shape.bbox().min, shape.bbox().max], float)
+    return [*0.5 * (low + high), 0.5 * (high[0] - low[0])]

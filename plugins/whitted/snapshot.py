@@ -29,7 +29,6 @@ from .. import is_known
 from ..variants import is_jit
 
 Value = TypeVar("Value")
-MAX_TRACKED = 2**16  # objects whose updates are counted one by one
 PLAIN = (bool, int, float, str, bytes, type(None))
 
 
@@ -37,20 +36,17 @@ class Updates:
     """Counts updates by ``mi.traverse`` of objects, by id: ids are unique while the objects live."""
 
     def __init__(self) -> None:
-        self._count = self._forgotten = 0
-        self._last: dict[int, int] = {}
+        self._count = 0
+        self._last: dict[int, int] = {}  # an object that gets the id of a dead one looks updated: no harm
 
     def note(self, thing: mi.Object) -> None:
         """Record that an object was updated."""
-        if len(self._last) >= MAX_TRACKED:  # from now on all look as if they had been updated
-            self._forgotten = self._count = self._count + 1
-            self._last.clear()
         self._count += 1
         self._last[id(thing)] = self._count
 
     def of(self, thing: mi.Object | None) -> int:
         """Return a number that differs from earlier ones if the object was updated since."""
-        return self._last.get(id(thing), self._forgotten)
+        return self._last.get(id(thing), 0)
 
 
 updates = Updates()
@@ -75,13 +71,13 @@ class SnapshotPart:
         if not (is_known(thing) or isinstance(thing, mi.Shape)):  # all that is read of shapes is in arrays
             self.comparable = False
         if is_jit() and hasattr(thing, "snapshot_state"):  # many are looked at in less time
-            plain, things, arrays = thing.snapshot_state()
-            self.state += *plain, *map(id, things)
-            self._held |= {id(x): x for x in things}
+            made, arrays = thing.snapshot_state()
+            self.state.append(id(made))
+            self._held[id(made)] = made
             self._arrays += arrays
             return
         own = getattr(thing, "__dict__", None) or {}  # of a class in Python
-        for name, value, kind in [*parameters_of(thing), *((name, own[name], None) for name in own)]:
+        for name, value, kind in [*parameters_of(thing), *((*item, None) for item in own.items())]:
             if isinstance(value, elsewhere):
                 continue
             self.state.append(name)
