@@ -171,7 +171,7 @@ def update_under_lock(
         # What contains an object whose own parameters were updated is updated, too
         for key, (_, _, node, _) in parameters.properties.items() if changed else ():
             if key.rsplit(".", 1)[-1] in changed.get(node, ()):
-                updates.note(node)
+                updates[id(node)] += 1
         return updated
 
 

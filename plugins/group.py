@@ -46,7 +46,6 @@ class MrtGroup(mi.Mesh):
         numbers = _table(props, "numbers", 3 * KINDS[kind].points + 1).astype(np.float64)
         _check(numbers)
         attributes = {name: _table(props, name) for name in props if name.startswith("face_")}
-        self.content = f"kind={kind}, objects={len(numbers)}"
         unit = KINDS[kind].mesh(segments(props, 8))
         self.table = QuadricTable(kind, numbers, Placement(props), unit)
         vertices, faces = map(len, unit)
@@ -64,7 +63,7 @@ class MrtGroup(mi.Mesh):
         return
 
     def to_string(self) -> str:
-        return f"MrtGroup[{self.content}]"
+        return f"MrtGroup[kind={self.table.kind}, objects={len(self.table.rows)}]"
 
 
 def _table(props: mi.Properties, name: str, width: int | None = None) -> np.ndarray:

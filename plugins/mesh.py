@@ -65,10 +65,9 @@ class MrtMesh(mi.Mesh):
         mi.Mesh.__init__(self, "mrt_mesh", count, len(faces), props, **buffers)
         flat = {f"vertex_{name}": array.astype(np.float32).ravel() for name, array in arrays.items()}
         write_buffers(self, **flat, faces=faces.astype(np.uint32).ravel())
-        self.content = f"positions={count}, faces={len(faces)}"
 
     def to_string(self) -> str:
-        return f"MrtMesh[{self.content}]"
+        return f"MrtMesh[positions={self.vertex_count()}, faces={self.face_count()}]"
 
 
 def _array(props: mi.Properties, name: str, *widths: int) -> np.ndarray:

@@ -96,7 +96,7 @@ def vector(
     try:
         numbers = [_without_tiny(x) for x in value]
     except (TypeError, ValueError):
-        _fail(props, name, value, "three finite numbers")
+        numbers = []
     if len(numbers) != 3 or not all(abs(x) <= LARGEST for x in numbers):
         _fail(props, name, value, "three finite numbers")
     if nonzero and not any(numbers):

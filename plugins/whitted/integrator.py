@@ -179,18 +179,17 @@ class MrtWhitted(mi.SamplingIntegrator):
         """Decide what the kernels for such a scene hold."""
         return make_plan(facts, self, None if self.sky is None else largest(self.sky))
 
-    def prepare(self, scene: mi.Scene, plan: KernelPlan | None = None) -> SceneData:
+    def prepare(self, scene: mi.Scene) -> SceneData:
         """Read a scene as it is now, and make the data of the kernels for ``trace``.
 
-        Cheap where nothing has changed since the last call. Without a ``plan`` of one's own, that of
-        ``kernel_plan``.
+        Cheap where nothing has changed since the last call.
         """
         self._snapshot = Snapshot(scene, self._snapshot)
         if self._snapshot.shape_part.differentiated and not self._warned:
             self._warned = True
             mi.Log(mi.LogLevel.Warn, DISCONTINUITY_WARNING)
         reading = Reading(self._snapshot, self._cache)
-        return SceneData(scene, reading, plan or self.kernel_plan(reading.facts), self._cache)
+        return SceneData(scene, reading, self.kernel_plan(reading.facts), self._cache)
 
     # ------------------------------------------- Tracing -----------------------------------------------
 

@@ -50,11 +50,10 @@ class Quadrics:
         numbers[self.leaf_of, 3, 1] = np.abs(self._boxes).max(axis=(1, 2))
         numbers[self.leaf_of, 3, 3] = np.repeat(sides, counts)
         self.numbers = Table(mi.Vector4f, numbers)
-        faces = np.zeros(leaves, int)
+        faces, owners = np.zeros((2, leaves), int)
         faces[self.leaf_of] = np.concatenate([t.first_faces for t in tables])
-        self.faces = Table(mi.UInt32, faces)
-        owners = np.zeros(leaves, int)
         owners[self.leaf_of] = np.repeat(np.arange(len(shapes)), counts)
+        self.faces = Table(mi.UInt32, faces)
         self.shapes = shape_ids([shapes[k] for k in owners])
         firsts = self.leaf_of[np.cumsum([0, *counts[:-1]])].tolist()  # of the first quadric of each shape
         frames = [s.moving_frame() for s in shapes]

@@ -152,8 +152,6 @@ class SceneData:
         o = self._off_surface(hit, ds.d)
         to_light = ds.p - o
         blocked = self.planes.separate(o, o + to_light * (1 - SHADOW_EPSILON))
-        if not self.plan.bvh and self.quadrics is None:
-            return blocked
         # Lights that have a surface of their own are Mitsuba's
         reach = 1 - (mi.math.ShadowEpsilon if self.facts.surface_emitters else SHADOW_EPSILON)
         ray = mi.Ray3f(o, to_light, reach, hit.si.time, hit.si.wavelengths)

@@ -29,7 +29,7 @@ class Planes:
         ]
         # The same kernel serves every plane of every scene: its numbers are data
         dr.make_opaque(self.equations)
-        self.tangents = [Table(mi.Vector3f, [s.tangents[k] for s in shapes]) for k in range(2)]
+        self.tangents = Table(mi.Vector3f, [s.tangents for s in shapes])
         self.shapes = shape_ids(shapes)
 
     def intersect(self, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Float, mi.UInt32, mi.Bool]:
@@ -73,7 +73,7 @@ class Planes:
         p = dr.fma(ray.d, ray.maxt, ray.o)
         # Along a grazing ray the error of t is far larger than that of the plane
         p -= n * _height(p, n, distance)
-        along = [tangent(index, where) for tangent in self.tangents]
+        along = [self.tangents(index, where, part) for part in range(2)]
         more = {"dp_du": along[0], "dp_dv": along[1]} if tangents else {}
         uv = mi.Point2f(*(dr.dot(tangent, p) for tangent in along))
         shape = shape_at(self.shapes, index, where)

@@ -16,6 +16,7 @@ one of materials or lights with a class that is somebody else's.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from functools import cache
@@ -32,24 +33,8 @@ Value = TypeVar("Value")
 PLAIN = (bool, int, float, str, bytes, type(None))
 
 
-class Updates:
-    """Counts updates by ``mi.traverse`` of objects, by id: ids are unique while the objects live."""
-
-    def __init__(self) -> None:
-        self._count = 0
-        self._last: dict[int, int] = {}  # an object that gets the id of a dead one looks updated: no harm
-
-    def note(self, thing: mi.Object) -> None:
-        """Record that an object was updated."""
-        self._count += 1
-        self._last[id(thing)] = self._count
-
-    def of(self, thing: mi.Object | None) -> int:
-        """Return a number that differs from earlier ones if the object was updated since."""
-        return self._last.get(id(thing), 0)
-
-
-updates = Updates()
+#: updates by ``mi.traverse`` of each object, by its id: unique while the object lives
+updates = Counter[int]()
 
 
 @dataclass(eq=False)
@@ -64,7 +49,7 @@ class SnapshotPart:
 
     def add(self, thing: mi.Object | None, elsewhere: tuple[type, ...], *facts: object) -> None:
         """Add an object and what it holds, but for objects of the classes that belong ``elsewhere``."""
-        self.state += [id(thing), updates.of(thing), *facts]
+        self.state += [id(thing), updates[id(thing)], *facts]
         if thing is None or id(thing) in self._held:
             return
         self._held[id(thing)] = thing
@@ -168,7 +153,7 @@ def _eye(scene: mi.Scene) -> tuple[float, ...] | None:
     if sensor is None or sensor.class_name() != "PerspectiveCamera":
         return None
     place = np.array(sensor.world_transform().translation(), float).ravel()
-    return tuple(place) if len(place) == 3 and np.isfinite(place).all() else None
+    return tuple(place) if np.isfinite(place).all() else None
 
 
 def parameters_of(thing: mi.Object) -> list[tuple[str, Any, Any]]:
