@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
@@ -73,3 +74,25 @@ def test_info_and_plugins_of_a_file(mrt_command, run_command, tmp_path):
     assert "\\x9b31m" in done.stdout
     done = mrt_command("check", "a.xml", "plugins=./mine.py", "quick=1", code=None)
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("mrt ex", ["export"]),
+        ("mrt out aam", ["aamode="]),
+        ("mrt out 3 aamode=s", ["aamode=sobel"]),
+        ("mrt diff a b fl", ["flip="]),
+        ("mrt sweep out wor", ["workers="]),
+    ],
+)
+def test_tab_completes_words(mrt_command, tmp_path, line, words):
+    variables = {"COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE": "1"}
+    variables |= {
+        "_ARGCOMPLETE_STDOUT_FILENAME": "found",
+        "_ARGCOMPLETE_IFS": "\n",
+        "_ARGCOMPLETE_SHELL": "fish",
+    }
+    mrt_command(**variables)
+    found = (tmp_path / "found").read_text().splitlines()
+    assert [each.split("\t")[0].strip() for each in found] == words
