@@ -268,7 +268,11 @@ def contribution_tail(stats: SampleStatistics, buffers: Sequence[int]) -> float:
 def pixel_variance(stats: SampleStatistics, blurred: Blurred | None) -> np.ndarray:
     """Return the estimated variance of each channel of the picture, linear, [H, W, 3], without the border."""
     linear = replace(stats, metric=LINEAR)
-    each = ray_variance(linear, linear.sums(0, 2), linear.sums(1, 3), unseen=2 * UNSEEN_PSEUDOCOUNT)
+    first, second = linear.sums(0, 2), linear.sums(1, 3)
+    each = ray_variance(linear, first, second, unseen=2 * UNSEEN_PSEUDOCOUNT)
+    quiet, also = window_means(np.stack([first.variance, second.variance]), 1) == 0
+    if not (second.variance[quiet].any() or first.variance[also].any()):
+        each[quiet & also] = 0  # where one met no noise, the other met none: a sky has none
     each *= linear.unit * (1 / stats.count[HALVES]).sum(0) / 4
     squares = stats.squared_errors(LINEAR)
     total = _calibrated(stats.without_border(stats.film.filtered_variance(each)), squares.mean(-1))
