@@ -46,9 +46,12 @@ def test_faults_three_times_as_large_as_documented_are_found(kind, fault):
     assert f"{fault.law}.{fault.criterion}" in exceeded(check), str(check)
 
 
-@pytest.mark.parametrize("law", ["sampling", "energy"])
-def test_pages_show_plots(law, tmp_path):
-    check = KINDS["BSDF"].check_fault(KINDS["BSDF"].laws[law].faults[0], quick=True)
+PLOTTED = [("BSDF", "sampling"), ("BSDF", "energy"), ("BSDF", "reciprocity"), ("shape", "normals")]
+
+
+@pytest.mark.parametrize(("kind", "law"), PLOTTED)
+def test_pages_show_plots(kind, law, tmp_path):
+    check = KINDS[kind].check_fault(KINDS[kind].laws[law].faults[0], quick=True)
     check.save(tmp_path)
     page = (tmp_path / "index.html").read_text()
     plots = re.findall(r'alt="Plot of (\w+)" src="data:image/png;base64,([^"]+)"', page)

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import noise, probe
+from . import noise, plots, probe
 from .bsdf_case import POINTWISE_TOL, BsdfCase, changed, parameters
 from .bsdf_snippets import SAMPLE, VALUE
 from .case import READS, READS_WHY, WAVE, reads_checked
@@ -165,6 +165,9 @@ def reciprocity(law: Outcome, case: BsdfCase) -> None:
     allowed = case.spread(forth, pairs)
     for name, other in (("swapped", back), ("modes", importance)):
         law.check(name, excess(value, other(pairs), allowed + case.spread(other, pairs)), pairs)
+    if not law.holds:
+        few = pairs[:3000]
+        law.plot = partial(plots.swapped, forth(few).max(axis=1), back(few).max(axis=1))
     _delta_either_way(law, case)
     # light that is reflected stays in its medium: integrators multiply by ``eta`` as they go
     s = case.drawn

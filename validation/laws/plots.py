@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .faults import PLACE
 from .probe import Array
 from .sphere import Cells
 
@@ -58,6 +59,18 @@ def density(cells: Cells, seen: Array, angle: float, figure: Figure) -> None:
     figure.suptitle(f"wi at {angle:.0f}° to the normal")
 
 
+def swapped(forth: Array, back: Array, figure: Figure) -> None:
+    """f(ωi, ωo) against f(ωo, ωi), both [N]."""
+    axes = figure.subplots()
+    lit = (forth > 0) & (back > 0)
+    axes.loglog(back[lit], forth[lit], ".", markersize=2)
+    ends = np.sort(back[lit])
+    axes.plot(ends, ends, color="black", linewidth=0.8, label="reciprocal")
+    axes.tick_params(axis="x", which="both", labelrotation=30)
+    axes.set(xlabel="f(ωo, ωi) η_i²", ylabel="f(ωi, ωo) η_o²")
+    axes.legend()
+
+
 def albedo(angles: Array, samples: Array, errors: Array, figure: Figure) -> None:
     """Mean weights of samples, with six standard errors, against the angle of incidence. [N] each"""
     axes = figure.subplots()
@@ -67,3 +80,15 @@ def albedo(angles: Array, samples: Array, errors: Array, figure: Figure) -> None
     axes.set(xlabel="angle of incidence (degrees; above 90 from behind)", ylabel="albedo, brightest channel")
     axes.set_ylim(bottom=0)
     axes.legend()
+
+
+def normals(p: Array, geometric: Array, shading: Array, figure: Figure) -> None:
+    """Normals at points [N, 3] of a surface, seen from (0.48, 0.36, 0.8), as colours (n + 1) / 2."""
+    right = np.cross((0, 1, 0), PLACE)
+    up = np.cross(PLACE, right)
+    both = {"geometric normal": geometric, "shading normal": shading}
+    for axes, (name, values) in zip(figure.subplots(1, 2), both.items(), strict=True):
+        axes.scatter(p @ right, p @ up, s=2, c=np.nan_to_num(np.clip(0.5 * values + 0.5, 0, 1)))
+        axes.set_title(f"{name}: (n + 1) / 2 as RGB")
+        axes.set_aspect("equal")
+        axes.set_axis_off()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -11,8 +12,9 @@ import numpy as np
 from numpy.linalg import norm
 from scipy import stats
 
+from . import plots
 from .case import READS, READS_WHY, WAVE, class_name, reads_checked
-from .faults import SIZE, larger, member, off_surface, put, tilted
+from .faults import PLACE, SIZE, larger, member, off_surface, put, tilted
 from .law import (
     MIN_QUANTILE_ERRORS,
     SIGNIFICANCE,
@@ -278,6 +280,9 @@ def normals(law: Outcome, case: ShapeCase) -> None:
     if same.sum() > MIN_QUANTILE_ERRORS:
         law.check("turned", dot(back.n, met.n) < -0.5, met, where=same)
     _differences(law, case)
+    if not law.holds:
+        towards = met[met.d @ PLACE < -0.5]
+        law.plot = partial(plots.normals, towards.p, towards.n, towards.shading)
 
 
 def _differences(law: Outcome, case: ShapeCase) -> None:
