@@ -21,7 +21,7 @@ class MrtGroup(mi.Mesh):
     =============== ========== ========== ==============================================================
     name            type       default    unit or range
     =============== ========== ========== ==============================================================
-    ``kind``        string     sphere     ``sphere``, ``cone``, ... (closed): mrt_ and the kind is a plugin
+    ``kind``        string     sphere     ``sphere`` or ``cone``, ...: of a plugin, its name without ``mrt_``
     ``numbers``     ``Bitmap`` required   float32 [n, 4] for spheres: centre, radius; [n, 7] for others: both
                                           points as the plugin of the kind names them, radius
     ``face_NAME``   ``Bitmap``            float32 [n, 1 or 3], values of the objects that a ``mesh_attribute``
