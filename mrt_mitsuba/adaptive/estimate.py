@@ -268,7 +268,8 @@ def contribution_tail(stats: SampleStatistics, buffers: Sequence[int]) -> float:
 def pixel_variance(stats: SampleStatistics, blurred: Blurred | None) -> np.ndarray:
     """Return the estimated variance of each channel of the picture, linear, [H, W, 3], without the border."""
     linear = replace(stats, metric=LINEAR)
-    first, second = linear.sums(0, 2), linear.sums(1, 3)
+    first = linear.sums(0, 2)
+    second = linear.sums(1, 3)
     each = ray_variance(linear, first, second, unseen=2 * UNSEEN_PSEUDOCOUNT)
     quiet, also = window_means(np.stack([first.variance, second.variance]), 1) == 0
     if not (second.variance[quiet].any() or first.variance[also].any()):
