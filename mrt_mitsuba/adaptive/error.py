@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
+from mrt_mitsuba.adaptive.metric import LINEAR
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,6 @@ class ErrorEstimate:
     def __str__(self) -> str:
         metric = "" if self.metric == LINEAR.name else f" {self.metric}"
         return f"{self.rmse:.3g}{metric} (95 %: {self.low:.3g} to {self.high:.3g})"
-
-    @property
-    def whole(self) -> str:
-        """The quantity of which a target in percent is a fraction."""
-        return METRICS[self.metric].whole
 
     def __repr__(self) -> str:
         target = "" if self.target is None else f", target {self.target:.3g}"

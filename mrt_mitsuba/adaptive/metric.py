@@ -17,7 +17,6 @@ class Metric:
 
     name = "linear"
     reference: float | None = None  #: value to which a target in percent refers; None: the mean luminance
-    whole = "the mean luminance"  #: the same in words
 
     def encode(self, values: np.ndarray) -> np.ndarray:
         """Values whose differences are errors."""
@@ -75,7 +74,6 @@ class DisplayMetric(Metric):
 
     name = "display"
     reference = 1.0
-    whole = "full white"
 
     def encode(self, values: np.ndarray) -> np.ndarray:
         clipped = np.clip(values, 0, 1)

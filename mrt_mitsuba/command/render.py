@@ -46,8 +46,6 @@ def run(options: Options) -> int:
         if result.error is not None:
             target = result.error.target
             aim = "" if target is None else f"; target {target:.3g}"
-            if target is not None and options.error is not None and options.error.relative:
-                aim += f", {options.error} of {result.error.whole}"
             print(f"Error: {result.error}, {result.rounds[-1].spp:.1f} spp{aim}")
         print(f"Wrote {printable(' and '.join(options.outputs()))}")
         print(f"Render time: {seconds:.6f}s")

@@ -242,12 +242,11 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
         job.start(plan, space)
         picture = _frames(shader, plan, job)
         layers = picture.layers
-        error = picture.error
         job.collect()
         return Result(
             image=layers["image"],
             layers=_channels(layers, plan),
-            plan=plan if error is None else plan.resolved(error.target, picture.left_out),
+            plan=dataclasses.replace(plan, left_out=plan.left_out + picture.left_out),
             timings=job.timings,
             rays=job.rays,
             kernel_launches=job.launches,
@@ -255,7 +254,7 @@ def render_source(source: Source, settings: RenderSettings, job: Job) -> Result:
             versions=runtime.versions(),
             camera=camera_matrices(source.sensor),
             inputs=frozenset(os.path.abspath(path) for path in source.inputs),
-            error=error,
+            error=picture.error,
             rounds=tuple(picture.rounds),
         )
 

@@ -49,7 +49,7 @@ class Passes:
         self.layers: dict[str, np.ndarray] = {}
         self.error: ErrorEstimate | None = None
         self.rounds: Sequence[Round] = ()
-        self.left_out: tuple[str, str] | None = None  # what the rounds did not need, and why
+        self.left_out: tuple[tuple[str, str], ...] = ()  # what the rounds did not need, and why
 
     def run(self) -> None:
         """Run the passes of the plan."""
@@ -161,7 +161,7 @@ class Passes:
             self._layer("error")[..., 0] = error
         self._layer("samples")[..., 0] = stats.samples()
         if denoiser and denoiser.left_out and finished.denoised is None:
-            self.left_out = ("denoising", denoiser.left_out)
+            self.left_out = (("denoising", denoiser.left_out),)
         if step.goal.denoise:
             denoised = finished.denoised
             weight = self._layer("denoised")

@@ -117,24 +117,15 @@ class Rounds(Pass):
     name = "rounds"
     gives = frozenset({"samples", "error", "variance", "noisy", "denoised"})
     goal: Goal
-    rmse: float | None = None  #: of the target; None until a round has been traced
 
     def __str__(self) -> str:
-        from mrt_mitsuba.adaptive.metric import LINEAR, METRICS
-
         goal = self.goal
-        metric = METRICS[goal.metric]
-        kind = "an error" if metric is LINEAR else f"a {metric.name} error"
-        if goal.target is None:
-            where = "the variance" if metric is LINEAR else f"the {metric.name} error"
-            denoised = ", denoised" if goal.denoise else ""
-            return f"adaptive sampling: {goal.max_spp} spp on average, allocated by {where}{denoised}"
-        error = str(goal.target)
-        if goal.target.relative and metric.reference is None:
-            error += " of the mean luminance" + ("" if self.rmse is None else f", {self.rmse:.3g}")
-        seconds = "" if goal.max_seconds is None else f" or {goal.max_seconds:g} s"
+        error = f"the {goal.metric} error"
         denoised = ", denoised where that pays" if goal.denoise else ""
-        return f"adaptive sampling to {kind} of {error}, at most {goal.max_spp} spp{seconds}{denoised}"
+        if goal.target is None:
+            return f"adaptive sampling: {goal.max_spp} spp on average, allocated by {error}{denoised}"
+        seconds = "" if goal.max_seconds is None else f" or {goal.max_seconds:g} s"
+        return f"adaptive sampling: {error} to {goal.target}, at most {goal.max_spp} spp{seconds}{denoised}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,12 +175,6 @@ class Plan:
     def blur(self) -> Blur | None:
         """The pass of the depth of field, if any."""
         return next((step for step in self.passes if isinstance(step, Blur)), None)
-
-    def resolved(self, rmse: float | None, left_out: tuple[str, str] | None = None) -> Plan:
-        """Return the plan with the RMSE of its target, and what the rounds left out."""
-        steps = (replace(step, rmse=rmse) if isinstance(step, Rounds) else step for step in self.passes)
-        further = () if left_out is None else (left_out,)
-        return replace(self, passes=tuple(steps), left_out=(*self.left_out, *further))
 
     def parameters(self) -> str:
         """Return the parameters of the render, one per line, as the original program prints them."""
