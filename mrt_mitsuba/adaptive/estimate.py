@@ -156,7 +156,7 @@ class SampleStatistics:
 
     def half_pictures(self, blurred: Blurred | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Colours of the half buffers, [H, W, 3], without the border; 0 where they are invalid."""
-        unknown = self.unknown(0)[..., None]
+        unknown = self.unknown()[..., None]
         first, second = (
             np.where(unknown, 0, self.film.picture(half[..., :3])) for half in self.halves.pictures()
         )
@@ -165,12 +165,10 @@ class SampleStatistics:
     def squared_errors(self, metric: Metric, blurred: Blurred | None = None) -> np.ndarray:
         """Squared errors of the picture, from the difference of the half buffers, [H, W, 3], without border.
 
-        They are 0 where the picture is invalid.
+        They are 0 where the picture is invalid, as both halves are.
         """
         squares = metric.squared_errors(*self.half_pictures(blurred))
-        if metric is self.metric:
-            squares = squares * self.curvature
-        return np.where(self.unknown(REACH if blurred else 0)[..., None], 0, squares)
+        return squares * self.curvature if metric is self.metric else squares
 
     @cached_property
     def curvature(self) -> float:
@@ -187,7 +185,7 @@ class SampleStatistics:
             pilots = np.moveaxis(self.sum[:, PILOTS] / self.count[PILOTS], 0, -1)
         else:
             pilots = self.pilots.pictures()
-        valid = ~self.unknown(0)
+        valid = ~self.unknown()
         first, second = (self.film.picture(picture)[valid] for picture in pilots)
         halves = [half[valid] for half in self.half_pictures()]
         found = 4 * metric.squared_errors((first + second) / 2, (halves[0] + halves[1]) / 2).mean()
@@ -215,9 +213,9 @@ class SampleStatistics:
         """True where the filter spreads invalid values to, [H, W]."""
         return dilated(self.invalid, self.film.reach)
 
-    def unknown(self, reach: int = 0) -> np.ndarray:
-        """True within ``reach`` pixels of invalid values of the picture, [H, W], without the border."""
-        return dilated(self.without_border(self.invalid_dilated), reach)
+    def unknown(self) -> np.ndarray:
+        """True where the picture is invalid, [H, W], without the border."""
+        return self.without_border(self.invalid_dilated)
 
     def without_border(self, values: np.ndarray) -> np.ndarray:
         """Values [H, W] without the border."""
