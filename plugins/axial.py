@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -26,7 +25,7 @@ class AxialMesh(mi.Mesh):
 
     kind: str  # without discs, "open " precedes it
     ends: tuple[str, str]  # names of the points
-    parameters: Mapping[str, Any] = MappingProxyType({})  # none while the mesh is being filled
+    parameters: dict[str, Any]
 
     def __init__(self, props: mi.Properties) -> None:
         name = props.plugin_name()
@@ -42,13 +41,13 @@ class AxialMesh(mi.Mesh):
         self.placement = Placement(props)
         self.unit = KINDS[self.kind].mesh(segments(props, 256))
         self._place(*ends, [radius])
+        parameters = dict(zip(self.ends, map(mi.Point3f, ends), strict=True))
+        self.parameters = {**parameters, "radius": updatable(radius)}
         vertices, faces = self.unit
         buffers = {"has_vertex_normals": True, "has_vertex_texcoords": True}
         mi.Mesh.__init__(self, name, len(vertices), len(faces), props, **buffers)
         uvs = vertices[:, 6:].astype(np.float32).ravel()
         write_buffers(self, vertex_texcoords=uvs, **self.table.proxy_mesh())
-        parameters = dict(zip(self.ends, map(mi.Point3f, ends), strict=True))
-        self.parameters = {**parameters, "radius": updatable(radius)}
         keep_apart(self, name)
 
     def _place(self, *parameters: Sequence) -> None:
@@ -62,7 +61,7 @@ class AxialMesh(mi.Mesh):
 
     def moving_frame(self) -> Frame | None:
         """Return the unit frame with its derivatives; None where none are wanted."""
-        return self._frame() if dr.grad_enabled(list(self.parameters.values())) else None
+        return self._frame() if dr.grad_enabled(self.parameters) else None
 
     def snapshot_state(self) -> tuple[object, list]:
         """Return what a snapshot compares instead of all attributes: an object that each change of the
@@ -78,7 +77,7 @@ class AxialMesh(mi.Mesh):
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
         if not set(self.parameters).isdisjoint(keys):
-            dr.make_opaque(list(self.parameters.values()))  # data of kernels: new values need no new one
+            dr.make_opaque(self.parameters)  # data of kernels: new values need no new one
             self._place(*self.parameters.values())
             if is_jit():
                 self._follow(self._frame())

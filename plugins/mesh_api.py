@@ -22,10 +22,7 @@ def write_buffers(mesh: mi.Mesh, **buffers: np.ndarray | mi.Float) -> None:
         # Scenes are loaded by several threads. The update evaluates the material of the mesh, too, which may
         # come from another one; Dr.Jit must know of such a handover
         dr.detail.new_scope(dr.backend_v(mi.Float))
-    parameters = mi.traverse(mesh)
-    for name, values in buffers.items():
-        parameters[name] = values
-    parameters.update()
+    mi.traverse(mesh).update(buffers)
 
 
 def triangles(mesh: mi.Mesh) -> np.ndarray:

@@ -78,7 +78,7 @@ class Reading:
 
 
 def _check_size(mesh: mi.Mesh) -> None:
-    low, high = (np.array(corner, float).ravel() for corner in (mesh.bbox().min, mesh.bbox().max))
+    low, high = np.array([mesh.bbox().min, mesh.bbox().max], float)
     extent = (high - low).max()
     farthest = np.abs([low, high]).max()
     fits = extent >= MIN_MESH_EXTENT and farthest <= MAX_MESH_COORDINATE
@@ -93,18 +93,18 @@ def _read_lights(
     snapshot: Snapshot,
 ) -> tuple[list[mi.Emitter], list[list[list[float]]] | None, Facts]:
     """Return the lights, their rows where all have some, and the facts about them."""
-    largest = {id(e): brightness(e) for e in snapshot.emitters}
-    lights = [e for e in snapshot.emitters if not e.is_environment() and largest[id(e)] != 0]
+    largest = {e: brightness(e) for e in snapshot.emitters}
+    lights = [e for e in snapshot.emitters if not e.is_environment() and largest[e] != 0]
     rows = light_rows(lights)
     environment = snapshot.environment
     delta = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
-    surfaces = [largest[id(e)] for e in lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
+    surfaces = [largest[e] for e in lights if mi.has_flag(e.flags(), mi.EmitterFlags.Surface)]
     facts = {
         "lights": len(lights),
         "random_lights": sum(not mi.has_flag(e.flags(), delta) for e in lights),
         "surface_emitters": len(surfaces),
         "environment": environment is not None,
-        "sky": 0.0 if environment is None else largest[id(environment)],
+        "sky": 0.0 if environment is None else largest[environment],
         "emission": max(surfaces, default=0.0),
         "lights_tabulated": rows is not None,
     }

@@ -23,7 +23,7 @@ from .tables import ByShape
 def material_rows(shapes: Sequence[mi.Shape]) -> tuple[list[np.ndarray], str]:
     """Return the ``fixed_row`` of the material of each shape, and ""; or none of them, and the reason why
     they have no place in one table."""
-    bsdfs = {id(b): b for b in (s.bsdf() for s in shapes)}
+    bsdfs = dict.fromkeys(s.bsdf() for s in shapes)
     if not is_jit():
         return [], SCALAR_VARIANT
     if mi.is_spectral:
@@ -31,14 +31,14 @@ def material_rows(shapes: Sequence[mi.Shape]) -> tuple[list[np.ndarray], str]:
     if any(s.class_name() == "Instance" for s in shapes):  # inside, shapes are not the scene's own
         return [], "instances in the scene"
     # Of the class itself: one derived from it may have other lobes
-    if not (bsdfs and all(map(is_mrt_bsdf, bsdfs.values()))):
+    if not (bsdfs and all(map(is_mrt_bsdf, bsdfs))):
         return [], f"a material other than {names_in('materials')}"
     for name in CHOICES:
-        if len({b.choices[name] for b in bsdfs.values()}) > 1:
+        if len({b.choices[name] for b in bsdfs}) > 1:
             return [], f'materials of different "{name}"'
-    rows = {key: bsdf.fixed_row() for key, bsdf in bsdfs.items()}
+    rows = {bsdf: bsdf.fixed_row() for bsdf in bsdfs}
     obstacle = next((row for row in rows.values() if isinstance(row, str)), "")
-    return [] if obstacle else [rows[id(s.bsdf())] for s in shapes], obstacle
+    return [] if obstacle else [rows[s.bsdf()] for s in shapes], obstacle
 
 
 class MaterialTable:
@@ -75,9 +75,7 @@ def has_mirror(bsdf: mi.BSDF) -> bool:
 
 
 def is_textured(bsdf: mi.BSDF) -> bool:
-    """True if a BSDF varies over its surface; the flags of Mitsuba's own do not say so."""
-    if is_mrt_bsdf(bsdf):
-        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.SpatiallyVarying)
+    """True if a BSDF varies over its surface, which the flags of Mitsuba's own do not say."""
     return any(varies(node) or not is_known(node) for node in mi.traverse(bsdf).hierarchy)
 
 

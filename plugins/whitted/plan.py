@@ -70,7 +70,7 @@ class SceneFacts:
 
 @dataclass(frozen=True)
 class KernelPlan:
-    """Every decision that changes a kernel. ``reason(name)`` says why one left something out."""
+    """Every decision that changes a kernel."""
 
     spheres: str  #: "none", "corrected": hits moved onto them, "table": and no call to the shape
     lights: str  #: "none", "unrolled", "loop" that calls each, or "table": a loop over their numbers
@@ -88,11 +88,7 @@ class KernelPlan:
     sky: str  #: "none", "parameter" or "environment"
     tangents: bool  #: derivatives of the surface by uv, and frames along them
     merged: bool  #: one BSDF with a table of materials, in place of a call to each
-    reasons: tuple[tuple[str, str], ...] = ()  #: what was left out, and why, in words
-
-    def reason(self, name: str) -> str | None:
-        """Return the reason for leaving ``name`` out; None where it is in."""
-        return dict(self.reasons).get(name)
+    reasons: tuple[tuple[str, str], ...] = ()  #: names of what was left out, and why, in words
 
 
 class IntegratorParams(Protocol):

@@ -33,7 +33,6 @@ class Quadrics:
         self.count = sum(counts)
         self.kinds = sorted({t.kind for t in tables})  # the kernel holds these only
         sides = [-1 if s.has_flipped_normals() else 1 for s in shapes]
-        self.flipped = -1 in sides
         self._boxes = np.concatenate([t.boxes() for t in tables])
         self.leaf_of = np.arange(self.count)
         leaves = self.count
@@ -126,11 +125,9 @@ class Quadrics:
         more = {}
         if tangents:
             more = {"dp_du": frame.to_world(by_u), "dp_dv": frame.to_world(by_v)}
-        if self.flipped:
-            n *= side
         shape = shape_at(self.shapes, leaf, where)
         more |= {"uv": mi.Point2f(u, v), "shape": shape, "prim_index": self.faces(leaf, where)}
-        put_where(where, si, t=t, p=p, n=mi.Normal3f(n), **more)
+        put_where(where, si, t=t, p=p, n=mi.Normal3f(n * side), **more)
         return dr.select(where, size, scale)
 
     def _row(self, leaf: mi.UInt32, active: mi.Bool = True) -> tuple[Frame, mi.Float, mi.Float, mi.Float]:

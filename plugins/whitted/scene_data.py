@@ -90,11 +90,13 @@ class SceneData:
         """Return all that the kernels read; None where they call plugins, which may read anything."""
         plan = self.plan
         sky = self.environment
-        if not self._comparable:
-            return None
-        tabulated = plan.merged and (plan.lights == "none" or self.facts.lights_tabulated)
-        tabulated = tabulated and (plan.spheres == "table" or not plan.bvh)
-        if not tabulated or (sky is not None and sky.class_name() != "ConstantBackgroundEmitter"):
+        tabulated = (
+            plan.merged,
+            plan.lights == "none" or self.facts.lights_tabulated,
+            plan.spheres == "table" or not plan.bvh,
+            sky is None or sky.class_name() == "ConstantBackgroundEmitter",
+        )
+        if not (self._comparable and all(tabulated)):
             return None
         rays = self._cache("rays", self._shape_key, _ray_arrays, self.bvh) if plan.bvh else []
         own = [self.planes, self.quadrics, self.errors, self.spheres, self.lights, self.merged]
@@ -219,8 +221,8 @@ def _trace(
     """
     exact = [s for s in reading.quadrics if s.table.kind in plan.quadrics]
     planes = reading.planes if plan.planes else []
-    own = {id(s) for s in (*exact, *planes)}
-    others = [s for s in reading.snapshot.shapes if id(s) not in own]
+    own = {*exact, *planes}
+    others = [s for s in reading.snapshot.shapes if s not in own]
     bvh = None
     if others and not plan.bvh:
         raise ValueError(f"the plan leaves {len(others)} shapes untraced: set its bvh to True")

@@ -124,7 +124,7 @@ class Snapshot:
             shapes.add(shape, elsewhere, shape.has_flipped_normals(), shape.is_emitter())
         bsdfs = [shape.bsdf() for shape in [*self.shapes, *self.inner]]
         materials.state += map(id, bsdfs)
-        self.bsdfs = list({id(b): b for b in bsdfs if b is not None}.values())  #: each material once
+        self.bsdfs = [b for b in dict.fromkeys(bsdfs) if b is not None]  #: each material once
         for bsdf in self.bsdfs:
             materials.add(bsdf, (mi.Shape, mi.Emitter, mi.Medium), bsdf.flags())
         for emitter in self.emitters:

@@ -78,8 +78,7 @@ class ByShape:
     ) -> None:
         self.fallback = kind(fallback)
         if not is_jit():
-            self.shapes = shapes  # alive, or their ids could pass to others
-            self.rows = {id(s): kind(row) for s, row in zip(shapes, rows, strict=True)}
+            self.rows = {s: kind(row) for s, row in zip(shapes, rows, strict=True)}
             return
         ids = np.array(shape_ids(shapes))
         numbers = np.empty((ids.max() + 1, *np.shape(rows)[1:]), np.float32)
@@ -91,7 +90,7 @@ class ByShape:
 
     def __call__(self, si: mi.SurfaceInteraction3f, active: mi.Bool, part: int = 0) -> Any:
         if not is_jit():
-            return self.rows.get(id(si.shape), self.fallback) if active else self.fallback
+            return self.rows.get(si.shape, self.fallback) if active else self.fallback
         ids = dr.reinterpret_array(mi.UInt32, si.shape)
         known = active & (ids < self.size)
         return dr.select(known, self.table(ids, known, part), self.fallback)
