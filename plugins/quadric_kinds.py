@@ -317,7 +317,7 @@ def _turn(q):
 
 
 def _line(o, d):
-    """Return a ray's line in the unit frame: p, u of s ↦ p + s u with |u| = 1, p · u = 0; and t of s."""
+    """Return p and u of the ray's line p + s u, |u| = 1 and p · u = 0, and the function that maps s to t."""
     length = dr.norm(d)
     u = d / length
     along = dr.dot(o, u)

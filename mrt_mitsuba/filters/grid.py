@@ -111,9 +111,9 @@ def finite(planes: Sequence[Float]) -> Mask:
 
 
 def window_means(values: np.ndarray, reach: int) -> np.ndarray:
-    """Means over windows of ``reach`` pixels, a power of two, to each side.
+    """Return the means [..., H, W] over square windows of ``reach`` pixels, a power of two, to each side.
 
-    Sums of 1, 2, 4, ... neighbours are each formed from the previous ones: no differences cancel.
+    Windows are clipped at the border. Sums are formed by doubling, so that no differences cancel.
     """
     rows, columns = values.shape[-2:]
     wide = np.zeros((*values.shape[:-2], rows + 2 * reach, columns + 2 * reach), values.dtype)

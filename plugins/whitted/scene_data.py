@@ -183,11 +183,9 @@ class SceneData:
     def eval_bsdf(
         self, hit: Hit, wos: list[mi.Vector3f], facing: list[mi.Bool], mirror: bool
     ) -> tuple[list[mi.UnpolarizedSpectrum], mi.UnpolarizedSpectrum, mi.Float]:
-        """Return the values f cos θo at ``hit`` towards ``wos``, the reflectance of the mirror, and the index
-        of refraction of the BSDF, all by one dispatch.
-
-        ``facing``: the lanes in which each direction is evaluated. ``mirror``: are the last two wanted.
-        """
+        """Return f cos θo for each local direction of ``wos`` (0 where its ``facing`` is false), the
+        reflectance of the mirror (0 if none) and the interior index of refraction (1 if unknown), by a single
+        dispatch. ``mirror``: whether to look up the last two."""
         context = context_of(self.plan.lobes)
         arguments = (hit.si, wos, facing, hit.found)
         # Not among the arguments, where dispatch would take a bool for its mask

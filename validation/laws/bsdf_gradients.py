@@ -151,10 +151,9 @@ def _derivatives(
 
 
 def _sampled(law: Outcome, case: BsdfCase, key: str) -> None:
-    """Check the derivative of samples' weights against that of values over a constant density.
+    """Check the mean derivative of sample weights against that of f cos θo / pdf, pdf and ωo detached.
 
-    Integrators follow a sample as a constant direction. Where one moves with the parameter, its weight may
-    change otherwise: only means over smooth light are then the same.
+    Single weights may differ where a sample moves with the parameter; under smooth light, means agree.
     """
     at = case.at_random(2**14, 2**16)
 

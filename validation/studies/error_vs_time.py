@@ -69,10 +69,10 @@ def run(study: Study, *, quick: bool) -> None:
 
 
 def choices(number: Number, cost: Cost) -> dict[str, Findings]:
-    """Measure everything that a user can choose in a scene, by a title for each of the two truths.
+    """Return the findings of a scene by title, against references by ``mrt_whitted`` and by ``path``.
 
-    ``mrt_whitted`` and ``path`` converge to pictures of their own. The Cornell box has paths alone; scenes
-    whose highlights are so narrow that rare paths dominate the error have none.
+    The Cornell box has ``path`` only; scenes in which rare bright paths dominate the error of ``path`` have
+    ``mrt_whitted`` only.
     """
     if number == BOX:
         return {f"{BOX}, light paths": path(number, cost)}
