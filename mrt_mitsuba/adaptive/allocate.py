@@ -49,15 +49,15 @@ class Allocator:
 
         No pixel counts as less noisy than ``floor`` times the mean deviation.
         """
-        room = (spp * self.film.pixels - float(stats.count.sum())) / 2
+        room = spp * self.film.pixels - float(stats.count.sum())
         rounding = self._rounding(stats)
         deviation = _smoothed(pilots.variance)
         deviation = np.maximum(deviation, floor * deviation.mean())
-        half = self._shares(stats.count[0], deviation, room / (1 + PILOT_RATIO), rounding)
+        half = self._shares(stats.count[0], deviation, room / 2 / (1 + PILOT_RATIO), rounding)
         wanted = PILOT_RATIO * (stats.count[0].ravel() + self._group * half)
         more = self._groups_to(wanted, stats.count[2].ravel(), rounding.ravel())
         allocation = np.stack([half, half, more, more])
-        if self._group * self.traced(allocation).sum() > 2 * room:  # rounded up too often
+        if self._group * self.traced(allocation).sum() > room:  # rounded up too often
             allocation[PILOTS] = self._groups_to(wanted, stats.count[2].ravel(), np.zeros_like(wanted))
         return allocation
 

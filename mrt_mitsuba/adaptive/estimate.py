@@ -30,7 +30,7 @@ WINDOWS = (2, 8)  # radii of the windows that pixels borrow variance from, in pi
 UNSEEN_PSEUDOCOUNT = 0.25  # noisy pixels that are assumed to be among the others, unseen
 SLOPE_DEVIATIONS = 6  # standard errors of a half over which a metric's slope is taken
 PRIOR_WEIGHT = 2  # squared errors that an estimated variance counts as much as
-SUBSET_PIXELS = 2**12  # pixels, about, from which mixtures, quantiles and factors are found
+SUBSET_PIXELS = 2**12  # pixels, about, from which mixtures and quantiles are found
 NOISE_FIELDS = 16  # pictures of noise that are blurred to estimate the variance after a blur
 LUMINANCE = (0.212671, 0.715160, 0.072169)  # of linear sRGB
 

@@ -46,7 +46,7 @@ import drjit as dr
 import numpy as np
 
 from mrt_mitsuba.errors import UsageError
-from mrt_mitsuba.filters.grid import Grid, dilated, finite
+from mrt_mitsuba.filters.grid import Grid, check_numbers, dilated, finite
 
 if TYPE_CHECKING:
     from mitsuba import Float, Int
@@ -115,9 +115,7 @@ def gaussian_dof(
 
 
 def _amount(grid: Grid, distance: Float, focal_distance: float, focal_range: float) -> Float:
-    for name, value in (("focal_distance", focal_distance), ("focal_range", focal_range)):
-        if math.isnan(value):
-            raise UsageError(f"{name} is not a number; give one")
+    check_numbers(focal_distance=focal_distance, focal_range=focal_range)
     if focal_distance <= 0:
         return dr.zeros(grid.Float, grid.count)
     defocus = dr.abs(dr.opaque(grid.Float, focal_distance) - distance)

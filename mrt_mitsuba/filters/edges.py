@@ -31,7 +31,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
-from mrt_mitsuba.filters.grid import Grid, finite
+from mrt_mitsuba.errors import UsageError
+from mrt_mitsuba.filters.grid import Grid, check_numbers, finite
 
 if TYPE_CHECKING:
     from mitsuba import Float, Mask
@@ -81,8 +82,13 @@ def luma_edges(
         variance: [H, W, 3], the variance of each pixel's mean; where it is NaN, nothing is an edge.
 
     Raises:
-        UsageError: for a wrong shape.
+        UsageError: for a wrong shape, or a threshold that is NaN.
     """
+    check_numbers(
+        contrast_offset=contrast_offset,
+        absolute_threshold=absolute_threshold,
+        relative_threshold=relative_threshold,
+    )
     grid = Grid(image)
     brightness = _sum(grid.planes(image, "image"), LUMA_WEIGHTS)
     luma = dr.select(dr.isfinite(brightness), dr.sqrt(dr.maximum(brightness, 0)), math.inf)
@@ -123,8 +129,9 @@ def sobel_edges(image: Array, *, threshold: float = 0.0, variance: Array | None 
         variance: [H, W, 3], the variance of each pixel's mean; where it is NaN, nothing is an edge.
 
     Raises:
-        UsageError: for a wrong shape.
+        UsageError: for a wrong shape, or a threshold that is NaN.
     """
+    check_numbers(threshold=threshold)
     grid = Grid(image)
     grey = 255 * _sum(grid.planes(image, "image"), GREY_WEIGHTS)
     # both sides of a difference are summed alike, so equal sides give 0
@@ -166,8 +173,12 @@ def geometry_edges(
         depth_step: relative, above 0.
 
     Raises:
-        UsageError: for a wrong shape.
+        UsageError: for a wrong shape, or a threshold out of its range.
     """
+    if not 0 < crease_angle <= 180:
+        raise UsageError(f"crease_angle={crease_angle} is out of range; give degrees above 0, at most 180")
+    if not depth_step > 0:
+        raise UsageError(f"depth_step={depth_step} is out of range; give a relative step above 0")
     grid = Grid(normal)
     normals = grid.planes(normal, "normal")
     distance = grid.flat(depth, (), "depth")

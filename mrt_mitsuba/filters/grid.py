@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import math
 import operator
 import sys
 from collections.abc import Callable, Sequence
@@ -103,6 +104,13 @@ class Grid:
         """
         values = np.stack([np.array(plane) for plane in planes], axis=-1)
         return values.reshape(self.rows, self.columns, *channels)
+
+
+def check_numbers(**options: float) -> None:
+    """Raise ``UsageError`` for an option that is NaN."""
+    for name, value in options.items():
+        if math.isnan(value):
+            raise UsageError(f"{name} is not a number; give one")
 
 
 def finite(planes: Sequence[Float]) -> Mask:

@@ -184,12 +184,13 @@ class Film:
     @cached_property
     def weights(self) -> np.ndarray:
         """Values of the filter along an axis, [pixels in its reach, ``FILTER_STEPS_PER_PIXEL``]."""
-        flat = self._offsets.ravel().tolist()
+        offsets = self._offsets
+        flat = offsets.ravel().tolist()
         if not is_jit():
             values = [self.rfilter.eval(place) for place in flat]
         else:  # a list is copied; for NumPy's memory, Dr.Jit would compile a kernel for every alignment
             values = self.rfilter.eval(mi.Float(flat))
-        return np.asarray(values, np.float64).reshape(self._offsets.shape)
+        return np.asarray(values, np.float64).reshape(offsets.shape)
 
     @property
     def correlation(self) -> float:

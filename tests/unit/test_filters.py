@@ -241,6 +241,9 @@ for find in DETECTORS:
     for shape in SHAPES:
         wrong(partial(find, np.zeros(shape)), "image has shape")
 wrong(partial(luma_edges, IMAGE, variance=IMAGE[:, 1:]), r"variance has shape \(4, 4, 3\); expected \[4")
+wrong(partial(geometry_edges, IMAGE, DEPTH, crease_angle=0), "crease_angle=0")
+wrong(partial(geometry_edges, IMAGE, DEPTH, depth_step=np.nan), "depth_step=nan")
+wrong(partial(sobel_edges, IMAGE, threshold=np.nan), "threshold is not a")
 wrong(partial(gaussian_dof, IMAGE, DEPTH, focal_distance=1, focal_range=np.nan), "focal_range is not a")
 wrong(partial(gaussian_dof, IMAGE, DEPTH.T, focal_distance=1), r"shape \(5, 4\); expected \[4, 5\]")
 
