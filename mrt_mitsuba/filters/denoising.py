@@ -7,6 +7,9 @@ greedy error minimization, 2011; Adaptive rendering with non-local means filteri
 mixture of the denoised picture and the plain mean with the least estimated error (A. Firmino, J. R. Frisvad
 and H. W. Jensen, Progressive denoising of Monte Carlo rendered images, 2022; S. Zheng and others, Ensemble
 denoising for Monte Carlo renderings, 2021).
+
+A denoised half gets back the low frequencies of the noisy one, in which noise is small: what a denoiser
+leaves there are blotches, which a viewer sees first.
 """
 
 from __future__ import annotations
@@ -29,7 +32,8 @@ if TYPE_CHECKING:
 
 Quality = Literal["fast", "balanced", "high"]
 
-REACH = 8  # pixels to each side of the windows in which squared errors are averaged
+REACH = 8  # pixels to each side of the windows in which squared errors and differences are averaged
+DARK = 0.1  # radiance below which differences count in absolute terms, above it in relative ones
 BLOCK = 8  # side, in pixels, of the blocks whose spread gives the interval of the error
 CORRELATED = 0.1  # correlation of the noise of two pixels above which they are not taken for independent
 MIN_SHARE = 0.3  # of the error that a pixel's noise makes typical: windows of few pixels may show none
@@ -95,6 +99,9 @@ def denoise(
     denoised = [_open_image_denoise(half, albedo, normal, quality) for half in inputs]
     if refilter is not None:
         denoised = [refilter(half) for half in denoised]
+    denoised = [
+        _with_low_frequencies(picture, half, valid) for picture, half in zip(denoised, halves, strict=True)
+    ]
     estimates = _Estimates.of(halves, denoised, encode or np.asarray, valid)
     weight = estimates.best_weight()
     share = weight[..., None]
@@ -127,6 +134,18 @@ def _open_image_denoise(color: Image, albedo: Image | None, normal: Image | None
             features["normal"] = np.ascontiguousarray(np.clip(np.nan_to_num(normal), -1, 1), np.float32)
     positive = np.ascontiguousarray(np.maximum(color, 0))
     return np.asarray(pyoidn.denoise(positive, **features, hdr=True, quality=quality))
+
+
+def _with_low_frequencies(denoised: Image, noisy: Image, valid: np.ndarray) -> Image:
+    """Return a denoised picture whose low frequencies are those of the noisy one.
+
+    Differences are relative to the picture, so that bright pixels do not spill into dark ones.
+    """
+    unit = np.maximum(denoised, 0) + np.float32(DARK)
+    missing = np.moveaxis(np.where(valid[..., None], (noisy - denoised) / unit, 0), -1, 0)
+    for _ in range(2):
+        missing = window_means(missing, REACH)
+    return np.asarray(denoised + unit * np.moveaxis(missing, 0, -1))
 
 
 @dataclass(frozen=True)

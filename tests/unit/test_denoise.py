@@ -93,7 +93,8 @@ def test_what_the_library_is_given(monkeypatch):
 
 def test_errors_of_pixels_are_calibrated():
     """Noise that grows along rows: in each fifth of the pixels by their stated errors, true errors are within
-    a factor of 2 (the promise is 3, in tenths of pictures that were rendered)."""
+    a factor of 2.5, although they are a ninth of the noise (the promise is 3, in tenths of pictures that were
+    rendered)."""
     deviation = 0.02 + 0.2 * column[..., None] / SIZE
     squares = []
     stated = []
@@ -106,7 +107,7 @@ def test_errors_of_pixels_are_calibrated():
     order = np.argsort(np.concatenate(stated))
     for fifth in np.array_split(order, 5):
         ratio = np.concatenate(squares)[fifth].mean() / np.concatenate(stated)[fifth].mean()
-        assert 1 / 4 < ratio < 4  # of squares
+        assert 2.5**-2 < ratio < 2.5**2  # of squares
 
 
 def test_what_a_screen_clips_counts_only_as_it_is_shown():
@@ -122,13 +123,26 @@ def test_what_a_screen_clips_counts_only_as_it_is_shown():
 
 @pytest.mark.parametrize(("filtered", "reach"), [(False, 0), (True, 2)])
 def test_no_pixel_decides_its_own_weight(monkeypatch, filtered, reach):
-    """Nor those that share its noise; other neighbours do: so the stated error of the mixture is honest."""
-    monkeypatch.setattr(denoising, "_open_image_denoise", lambda *_: np.float32(SMOOTH + 0.07))
+    """Nor those that share its noise, but for a little that low frequencies spread; other neighbours do:
+    so the stated error of the mixture is honest."""
+    monkeypatch.setattr(denoising, "_open_image_denoise", lambda *_: np.float32(SMOOTH + 0.1 * CHESSBOARD))
     halves = [noisy(SMOOTH, seed, 0.1, filtered) for seed in range(2)]
     before = filters.denoise(*halves).weight
     halves[0][50, 50] += 1
     change = abs(filters.denoise(*halves).weight - before)[50, 50:]
-    assert change[: reach + 1].max() < 1e-6 < 1e-3 < change[reach + 2]
+    assert change[: reach + 1].max() < 0.1 * change[reach + 2]
+
+
+def test_low_frequencies_are_those_of_the_halves(monkeypatch):
+    """What a denoiser changes over wide areas comes back, not what it takes away between neighbours; a bright
+    pixel does not spill into dark ones."""
+    monkeypatch.setattr(denoising, "_open_image_denoise", lambda *_: np.float32(0.8 * HALF_BRIGHT))
+    halves = [noisy(HALF_BRIGHT, seed, 0.05) for seed in range(2)]
+    halves[0][20, 70] *= 1.5
+    difference = filters.denoise(*halves).image - HALF_BRIGHT
+    inside = abs(column[0] - SIZE // 2) > 20
+    assert rms(difference[24:72, inside]) < 0.01
+    assert abs(difference[24:72, SIZE // 2 - 8 : SIZE // 2]).max() < 0.1
 
 
 def test_features_keep_what_noise_hides():
