@@ -111,13 +111,13 @@ class SampleStatistics:
         In this unit, squares of variances fit into single precision. Both are taken from the pilot buffers,
         so that no averaged value affects its own weight, even by rounding.
         """
-        count = self.count[PILOTS].sum(0)
+        count = self.count[PILOTS].sum(0).astype(np.float32)
         sums = Sums(count, self.sum[:, PILOTS].sum(1), self.sum_sq[PILOTS].sum(0))
         weights: np.ndarray = np.ones(self.film.shape, np.float32)
         if self.metric is not LINEAR:
             # a pixel at the edge of a light may have missed it: the clipped end of the metric is in reach
             deviation = SLOPE_DEVIATIONS * np.sqrt(window_means(sums.variance, 1) / self.count[0])
-            slopes = self.metric.weights(sums.mean, deviation)
+            slopes = self.metric.weights(sums.mean, deviation.astype(np.float32))
             energy = np.square(sums.mean) + np.float32(1e-30)  # noise of a channel is about as large as it
             weights = (slopes * energy).sum(0) / energy.sum(0)
         unit = float((weights * sums.sum_sq).sum() / max(count.sum(), 1)) or 1.0
@@ -154,21 +154,33 @@ class SampleStatistics:
         """The mean of the half buffers, [H, W, channels], without the border."""
         return self.halves.mean()
 
-    def half_pictures(self, blurred: Blurred | None = None) -> tuple[np.ndarray, np.ndarray]:
+    @cached_property
+    def half_pictures(self) -> tuple[np.ndarray, np.ndarray]:
         """Colours of the half buffers, [H, W, 3], without the border; 0 where they are invalid."""
-        unknown = self.unknown()[..., None]
-        first, second = (
-            np.where(unknown, 0, self.film.picture(half[..., :3])) for half in self.halves.pictures()
-        )
-        return (first, second) if blurred is None else (blurred(first), blurred(second))
+        first, second = self.halves.pictures()
+        return self._valid(first), self._valid(second)
+
+    def _valid(self, picture: np.ndarray) -> np.ndarray:
+        """Colours [H, W, 3] of a picture with the border, without it; 0 where they are invalid."""
+        return np.where(self.unknown()[..., None], 0, self.film.picture(picture[..., :3]))
 
     def squared_errors(self, metric: Metric, blurred: Blurred | None = None) -> np.ndarray:
         """Squared errors of the picture, from the difference of the half buffers, [H, W, 3], without border.
 
         They are 0 where the picture is invalid, as both halves are.
         """
-        squares = metric.squared_errors(*self.half_pictures(blurred))
+        if metric is self.metric and blurred is None:
+            return self._squared_errors * self.curvature
+        first, second = self.half_pictures
+        if blurred is not None:
+            first, second = blurred(first), blurred(second)
+        squares = metric.squared_errors(first, second)
         return squares * self.curvature if metric is self.metric else squares
+
+    @cached_property
+    def _squared_errors(self) -> np.ndarray:
+        """Squared errors in the metric, without its curvature, [H, W, 3]."""
+        return self.metric.squared_errors(*self.half_pictures)
 
     @cached_property
     def curvature(self) -> float:
@@ -182,14 +194,13 @@ class SampleStatistics:
         if metric is LINEAR:
             return 1.0
         if self.pilots is None:
-            pilots = np.moveaxis(self.sum[:, PILOTS] / self.count[PILOTS], 0, -1)
+            pilots = np.moveaxis(self.sum[:, PILOTS] / np.float32(self.count[PILOTS]), 0, -1)
         else:
             pilots = self.pilots.pictures()
-        valid = ~self.unknown()
-        first, second = (self.film.picture(picture)[valid] for picture in pilots)
-        halves = [half[valid] for half in self.half_pictures()]
+        first, second = (self._valid(picture) for picture in pilots)
+        halves = self.half_pictures
         found = 4 * metric.squared_errors((first + second) / 2, (halves[0] + halves[1]) / 2).mean()
-        found -= metric.squared_errors(*halves).mean()
+        found -= self._squared_errors.mean()
         expected = metric.squared_errors(first, second).mean()
         growth = self.count[PILOTS].sum() / self.count[HALVES].sum()
         return 1 + float(np.clip(found / max(expected, 1e-300) - 1, 0, 1)) * math.sqrt(growth)

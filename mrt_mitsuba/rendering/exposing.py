@@ -9,6 +9,7 @@ and are short enough for progress to show; scalar variants trace ray by ray in P
 from __future__ import annotations
 
 import logging
+import math
 import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Mapping
@@ -34,8 +35,8 @@ log = logging.getLogger(__name__)
 
 Values = list[Any]  # of rays, by channel: mi.Float, in scalar variants np.ndarray
 FILM_PREFIX = "film:"  # of the names of channels of the film and the integrator, which are no layers
-WAVEFRONT = 2**20  # rays of the first wavefront; later ones take QUICK to SLOW seconds each
-QUICK, SLOW = 0.25, 1.0
+WAVEFRONT = 2**20  # rays of the first wavefront, and of later ones at least
+WAVEFRONT_SECONDS = 0.5  # that later ones take, about
 
 
 @dataclass(frozen=True)
@@ -322,19 +323,23 @@ class Exposer:
         *,
         pictures: int = 1,
         moments: bool = False,
+        timed: bool = True,
         advance: Advance,
     ) -> Canvas:
-        """Return a canvas with the values of rays; with ``moments``, the squares of their colours, too."""
+        """Return a canvas with the values of rays; with ``moments``, the squares of their colours, too.
+
+        ``timed``: time may decide where wavefronts are cut; not for random numbers that depend on the cuts.
+        """
         film = self.film
         rays = groups.rays_of(pictures * film.pixels).reshape(pictures, -1)
         canvas = Canvas(film, rays, len(self.names), moments=moments)
-        for _, some, place, values in self._wavefronts(groups, samples, 2 * len(self.names)):
+        for _, some, place, values in self._wavefronts(groups, samples, 2 * len(self.names), timed):
             canvas.put(place, values, some.rays_of(rays.size))
             advance(some.rays)
         return canvas
 
     def _wavefronts(
-        self, groups: RayBatch, samples: Samples, channels: int
+        self, groups: RayBatch, samples: Samples, channels: int, timed: bool = True
     ) -> Iterator[tuple[slice, RayBatch, Any, Values]]:
         """Trace rays in wavefronts, each small enough for ``channels`` values of its rays to fit into memory.
 
@@ -344,8 +349,6 @@ class Exposer:
         width = self.film.width if self.film else self.shader.width
         most = wavefront_size(self.job.workspace, channels)
         self._wavefront = min(most, self._wavefront)
-        # the random numbers of Mitsuba's samplers depend on the cuts, which time must not decide
-        timed = self.film is None or self.film.independent
         start = time.perf_counter()
 
         def limit() -> int:
@@ -371,10 +374,9 @@ class Exposer:
             del place, values
             seconds = time.perf_counter() - start
             start += seconds
-            if timed and seconds < QUICK:
-                self._wavefront = min(2 * self._wavefront, most)
-            elif timed and seconds > SLOW:
-                self._wavefront = max(self._wavefront // 2, min(self._wavefront, WAVEFRONT))
+            if timed:  # a power of two, so that Dr.Jit finds arrays to use again
+                known = round(math.log2(max(some.rays * WAVEFRONT_SECONDS / seconds, 1)))
+                self._wavefront = min(max(2**known, WAVEFRONT), most)
 
     def _one_by_one(self, groups: RayBatch, samples: Samples) -> tuple[np.ndarray, Values]:
         """Trace rays in a loop in Python, for scalar variants."""

@@ -115,7 +115,9 @@ class Passes:
         samples = exposer.samples(step.pattern, self._seed_of(step))
         moments = "square" in step.layers
         with self._job.stage(step.name, len(pixels) * rays, step.message) as advance:
-            exposed = exposer.expose(RayBatch(rays, pixels), samples, moments=moments, advance=advance)
+            exposed = exposer.expose(
+                RayBatch(rays, pixels), samples, moments=moments, timed=film.independent, advance=advance
+            )
             before = before or FilmAccumulator.blank(film, 1, len(exposer.names))
             accumulated = before.accumulate(exposed, chosen)
         self._count(rays, edge)

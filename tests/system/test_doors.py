@@ -100,7 +100,7 @@ def test_a_script_on_a_terminal_shows_a_bar_that_moves(monkeypatch, capsys):
     assert type(default_progress()) is Progress
     whole = mrt.render(3, width=64, height=48, aa=2, aamode="none", focaldist=0).image
     monkeypatch.setattr(exposing, "WAVEFRONT", 2048)
-    monkeypatch.setattr(exposing, "QUICK", 0)
+    monkeypatch.setattr(exposing, "WAVEFRONT_SECONDS", 0)
     monkeypatch.setattr(sys, "stderr", Terminal())
     progress = default_progress()
     progress.delay = 0
