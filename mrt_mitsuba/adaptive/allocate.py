@@ -36,12 +36,6 @@ class Allocator:
         """An allocation with groups around the pixels of halves as far as the filter reaches."""
         return np.concatenate([widened(self.film, allocation[HALVES]), allocation[PILOTS]])
 
-    def required_spp(self, stats: SampleStatistics, pilots: PilotEstimate, rmse: float) -> float:
-        """Total mean spp that reaches an RMSE, as predicted by the pilots."""
-        deviation = np.sqrt(pilots.variance, dtype=np.float64)
-        half = np.maximum(deviation * (deviation.mean() / (2 * rmse**2)), stats.count[0])
-        return float(2 * (half - stats.count[0]).mean() + stats.count.sum(0).mean())
-
     def allocate(
         self, stats: SampleStatistics, pilots: PilotEstimate, spp: float, floor: float = 0.0
     ) -> np.ndarray:

@@ -41,7 +41,6 @@ Blurred = Callable[[np.ndarray], np.ndarray]
 class PilotEstimate:
     """What the pilot buffers say of the picture so far."""
 
-    rmse: float  #: of the picture as it is
     variance: np.ndarray  #: of a ray, [H, W], in units of the squared error
     uncertainty: float  #: relative standard error of an RMSE that halves estimate
 
@@ -321,14 +320,11 @@ def pixel_error(stats: SampleStatistics, variance: np.ndarray, blurred: Blurred 
 
 
 def pilot_estimate(stats: SampleStatistics) -> PilotEstimate:
-    """Return the RMSE of the picture so far and the variance per ray, both estimated from the pilot buffers,
-    and how uncertain an RMSE is that the two halves estimate."""
+    """Return the variance per ray, by the pilot buffers, and how uncertain an RMSE of the halves is."""
     variance = ray_variance(stats, stats.sums(2), stats.sums(3)) * np.float32(stats.unit)
-    left = stats.without_border(variance / stats.count[HALVES].sum(0))
     squares, _ = differences(stats.sums(2), stats.sums(3))
     number = effective_number(squares) / stats.film.correlation
     return PilotEstimate(
-        rmse=math.sqrt(float(left.mean())),
         variance=variance,
         uncertainty=0.5 / math.sqrt(max(number, 1)),
     )

@@ -197,11 +197,8 @@ def plan_round(
     if caution * now.rmse <= target:
         return None
     wanted = TARGET_MARGIN * target / (caution * now.rmse)
-    # growth of the ray count if spread evenly, and if allocated by the pilots' noise, which promises too much
-    uniform = wanted**-2
-    adaptive = allocator.required_spp(stats, seen, max(wanted * seen.rmse, 1e-100)) / now.spp
-    growth = math.sqrt(uniform * adaptive) ** (1 / (1 + allocator.gain))
-    return _nonempty(allocator, stats, seen, min(most, now.spp * max(growth, 2 * MIN_GROWTH - 1)), most)
+    growth = max(wanted ** (-2 / (1 + allocator.gain)), 2 * MIN_GROWTH - 1)
+    return _nonempty(allocator, stats, seen, min(most, now.spp * growth), most)
 
 
 def _nonempty(
