@@ -173,11 +173,12 @@ class _Estimates:
         fa, fb = (np.asarray(encode(half), np.float64) for half in denoised)
         noise = a - b
         change = fa - fb
-        error = ((fa - b) ** 2 + (fb - a) ** 2 - noise**2) / 2 - change**2 / 4
+        plain = _mean_product(noise, noise)
+        error = (_mean_product(fa - b, fa - b) + _mean_product(fb - a, fb - a) - plain) / 2
         return cls(
-            variance=np.where(valid, np.square(noise).mean(-1) / 4, 0),
-            error=np.where(valid, error.mean(-1), 0),
-            covariance=np.where(valid, (change * noise).mean(-1) / 4, 0),
+            variance=np.where(valid, plain / 4, 0),
+            error=np.where(valid, error - _mean_product(change, change) / 4, 0),
+            covariance=np.where(valid, _mean_product(change, noise) / 4, 0),
             reach=_correlated_reach(np.where(valid, noise.mean(-1), 0)),
         )
 
@@ -205,6 +206,11 @@ class _Estimates:
         """Squared error of a mixture, [H, W]; of a single pixel, it may be negative."""
         plain = 1 - weight
         return weight**2 * self.error + plain**2 * self.variance + 2 * weight * plain * self.covariance
+
+
+def _mean_product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the mean of products over the channels, [H, W]."""
+    return np.einsum("hwc,hwc->hw", first, second) / first.shape[-1]
 
 
 def _correlated_reach(noise: np.ndarray) -> int:
