@@ -42,7 +42,6 @@ MIN_RAYS = 2**17  # of a picture with a target: fewer do not show what is rare
 ENOUGH = 0.9  # fraction of them that counts as all, as allocations are rounded
 MIN_RELATIVE_DEVIATION = 0.25  # fraction of the mean deviation that each pixel has, until there are MIN_RAYS
 FIRST_GAIN = 1.0  # of rays that go where noise is, after an even first round; see ``gain`` of samplers
-TARGET_MARGIN = 0.97  # fraction of the target aimed for: what is foreseen is as often too low as too high
 SAFETY = 1.5  # standard errors of the RMSE below the target, so that few pictures exceed it
 
 OnRound = Callable[[RoundPicture], object]
@@ -197,9 +196,8 @@ def plan_round(
     caution = 1 + SAFETY * seen.uncertainty
     if caution * now.rmse <= target:
         return None
-    wanted = TARGET_MARGIN * target / (caution * now.rmse)
     gain = allocator.gain if np.ptp(stats.count) else FIRST_GAIN
-    growth = max(wanted ** (-2 / (1 + gain)), 2 * MIN_GROWTH - 1)
+    growth = max((caution * now.rmse / target) ** (2 / (1 + gain)), 2 * MIN_GROWTH - 1)
     return _nonempty(allocator, stats, seen, min(most, now.spp * growth), most)
 
 

@@ -79,7 +79,7 @@ class PixelSequence(mi.Sampler):
     """
 
     group = 2
-    gain = 0.3
+    gain = 0.25
 
     def __init__(self, props: Any) -> None:
         mi.Sampler.__init__(self, props)

@@ -45,7 +45,7 @@ def ablations() -> dict[str, list[Change]]:
         "MIN_GROWTH 1.01": [(rounds, "MIN_GROWTH", 1.01)],
         "MIN_RAYS 0": [(rounds, "MIN_RAYS", 0)],
         "MIN_RELATIVE_DEVIATION 0": [(rounds, "MIN_RELATIVE_DEVIATION", 0.0)],
-        "TARGET_MARGIN 1": [(rounds, "TARGET_MARGIN", 1.0)],
+        "FIRST_GAIN 0.25": [(rounds, "FIRST_GAIN", 0.25)],
         "SAFETY 0": [(rounds, "SAFETY", 0.0)],
         "gain 0": [(sequence, "gain", 0.0)],
     }
