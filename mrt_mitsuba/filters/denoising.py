@@ -137,7 +137,7 @@ def _open_image_denoise(color: Image, albedo: Image | None, normal: Image | None
 
 
 def _with_low_frequencies(denoised: Image, noisy: Image, valid: np.ndarray) -> Image:
-    """Return a denoised picture whose low frequencies are those of the noisy one.
+    """Return a denoised picture, 0 or more, whose low frequencies are those of the noisy one.
 
     Differences are relative to the picture, so that bright pixels do not spill into dark ones.
     """
@@ -145,7 +145,7 @@ def _with_low_frequencies(denoised: Image, noisy: Image, valid: np.ndarray) -> I
     missing = np.moveaxis(np.where(valid[..., None], (noisy - denoised) / unit, 0), -1, 0)
     for _ in range(2):
         missing = window_means(missing, REACH)
-    return np.asarray(denoised + unit * np.moveaxis(missing, 0, -1))
+    return np.maximum(denoised + unit * np.moveaxis(missing, 0, -1), 0)
 
 
 @dataclass(frozen=True)

@@ -145,6 +145,14 @@ def test_low_frequencies_are_those_of_the_halves(monkeypatch):
     assert abs(difference[24:72, SIZE // 2 - 8 : SIZE // 2]).max() < 0.1
 
 
+def test_no_light_is_negative(monkeypatch):
+    """Where a denoiser leaves more light than the halves have, on some pixels only."""
+    stripes = np.where(column[..., None] % 2, 0.4, 0) * np.ones(3, np.float32)
+    monkeypatch.setattr(denoising, "_open_image_denoise", lambda *_: np.float32(stripes))
+    lit = np.random.default_rng(0).random((2, *stripes.shape)) < 0.1
+    assert filters.denoise(*np.where(lit, np.float32(0.5), np.float32(0))).image.min() >= 0
+
+
 def test_features_keep_what_noise_hides():
     """Stripes are lost in the noise, unless the albedo shows them."""
     stripes = np.where(column // 2 % 2, 0.3, 0.7)[..., None] * np.ones(3, np.float32)
