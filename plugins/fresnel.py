@@ -35,6 +35,9 @@ def fresnel_schlick(cos_theta, f0, sin2_theta=None):
 def fresnel_dielectric(cos_theta, ext_ior, int_ior, sin2_theta=None):
     """Return the unpolarised reflectance of a dielectric interface, in [0, 1]; 1 in total reflection.
 
+    ``ext_ior`` is that of the side that the light comes from, at the angle of ``cos_theta``; ``sin2_theta``,
+    if it is known, saves taking it from the cosine.
+
     The textbook form ``½(Rs + Rp)`` (Snell and Fresnel; see e.g. Pharr, Jakob and Humphreys, PBR 4th ed.,
     §9.3) with both numerators expanded by their conjugates, so that the factor ``1 − η²`` stands alone and
     nothing cancels when the two media are nearly alike: with η = int/ext and g = η cos θt = √(η² − sin²θ),

@@ -73,6 +73,7 @@ class Diffuse:
         return at.given[self.reflectance] * (dr.inv_pi * pair.wo.z)
 
     def density(self, at: Lobes, pair: Pair) -> mi.Float:
+        """Return the density of the cosine-weighted hemisphere, per solid angle."""
         return dr.inv_pi * pair.wo.z
 
     def sample(self, at: Lobes, wi: mi.Vector3f, sample2: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
@@ -98,7 +99,8 @@ class Specular:
         return at.given[self.reflectance] * fresnel * lobe
 
     def density(self, at: Lobes, pair: Pair) -> mi.Float:
-        """Return the density of the microfacet normal over 4 ωo·h."""
+        """Return the density per solid angle with which ``sample`` draws ``pair.wo``: that of the microfacet
+        normal h over 4 ωo·h."""
         d = at.distribution.d(pair.tan2_theta_h, at.alpha)
         if at.visible:
             return 0.25 * d * at.distribution.visible_over_cos(pair.wi, at.alpha)
@@ -173,7 +175,8 @@ class Lobes:
 
     @cached_property
     def alpha(self) -> mi.Float:
-        """The roughness within what float32 resolves."""
+        """The roughness alpha, with its sign, its size clipped to [ALPHA_MIN, ALPHA_MAX], which float32
+        resolves."""
         alpha = self.given["alpha"]
         size = _within(dr.abs(alpha), ALPHA_MIN, ALPHA_MAX)
         return dr.select(alpha < 0, -size, size)

@@ -57,7 +57,7 @@ def error_against_time() -> Answer:
     panels: dict[str, work_precision.Findings] = {}
     cost = error_vs_time.QUICK if pages.QUICK else error_vs_time.DOCS
     for scene in scenes:
-        panels |= error_vs_time.choices(scene, cost)
+        panels |= error_vs_time.scene_findings(scene, cost)
     plots = [
         work_precision.diagram(title, found)
         for title, found in panels.items()

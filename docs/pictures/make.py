@@ -114,7 +114,7 @@ def error_against_time(quick: bool) -> Image.Image:
     panels = []
     for scene in (3, error_vs_time.BOX):
         cost = error_vs_time.QUICK if quick else error_vs_time.DOCS
-        for title, found in error_vs_time.choices(scene, cost).items():
+        for title, found in error_vs_time.scene_findings(scene, cost).items():
             panels.append(np.asarray(rasterized(work_precision.diagram(title, found))))
     return Image.fromarray(np.hstack(panels))
 

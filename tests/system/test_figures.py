@@ -33,6 +33,6 @@ def test_a_study_answers_what_pages_show():
         targets=("20%",),
         samplers=("independent", "multijitter"),
     )
-    panels = error_vs_time.choices(0, cost)
+    panels = error_vs_time.scene_findings(0, cost)
     assert [bool(found.failed) for found in panels.values()] == [False, False]
     assert all(found.errors for found in panels.values())

@@ -64,11 +64,11 @@ DOCS = Cost(
 def run(study: Study, *, quick: bool) -> None:
     """Fill the study."""
     for number in study.each(TITLE, (0,) if quick else SCENES):
-        for title, found in choices(number, QUICK if quick else Cost()).items():
+        for title, found in scene_findings(number, QUICK if quick else Cost()).items():
             describe(study, found, title, title)
 
 
-def choices(number: Number, cost: Cost) -> dict[str, Findings]:
+def scene_findings(number: Number, cost: Cost) -> dict[str, Findings]:
     """Return the findings of a scene by title, against references by ``mrt_whitted`` and by ``path``.
 
     The Cornell box has ``path`` only; scenes in which rare bright paths dominate the error of ``path`` have
