@@ -2,6 +2,7 @@
 
 import io
 import sys
+import warnings
 from contextlib import nullcontext
 
 import drjit as dr
@@ -112,3 +113,19 @@ def test_a_script_on_a_terminal_shows_a_bar_that_moves(monkeypatch, capsys):
     progress.stage = lambda *_: nullcontext(steps.append)
     mrt.render(3, width=64, height=48, aa=2, aamode="none", focaldist=0, progress=progress)
     assert steps == [512] * 6
+
+
+@pytest.mark.parametrize(("options", "grows"), [({"target": 1e-9, "maxspp": 64}, True), ({"spp": 64}, False)])
+def test_time_cuts_wavefronts_unless_random_numbers_depend_on_it(monkeypatch, options, grows):
+    """Those of rounds do not; those of Mitsuba's samplers do."""
+    monkeypatch.setattr(exposing, "WAVEFRONT", 512)
+    monkeypatch.setattr(exposing, "WAVEFRONT_SECONDS", 1e9)  # so that any speed asks for the largest
+    steps: list[int] = []
+    progress = Progress()
+    progress.stage = lambda *_: nullcontext(steps.append)
+    scene = box()
+    scene["sensor"]["sampler"] = {"type": "multijitter"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mrt.MrtWarning)  # the target is out of reach
+        mrt.render(scene, integrator="path", progress=progress, **options)
+    assert (max(steps) > 512) is grows
