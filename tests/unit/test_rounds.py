@@ -260,7 +260,7 @@ def test_a_target_takes_rays_enough_to_show_what_is_rare():
 
 
 def test_a_target_is_reached_in_few_rounds():
-    """6.3 in the mean: each is as large as is foreseen to be enough, up to the growth that is allowed."""
+    """6.7 in the mean: each is as large as is foreseen to be enough, up to the growth that is allowed."""
     assert np.mean([len(_render(Draws(_calm), seed, 0.02, 9000).rounds) for seed in range(10)]) < 7.3
 
 
