@@ -34,6 +34,7 @@ Quality = Literal["fast", "balanced", "high"]
 
 REACH = 8  # pixels to each side of the windows in which squared errors and differences are averaged
 DARK = 0.1  # radiance below which differences count in absolute terms, above it in relative ones
+OUTLIER = 10  # difference, relative to the picture, from which a value is that of a rare bright sample
 BLOCK = 8  # side, in pixels, of the blocks whose spread gives the interval of the error
 CORRELATED = 0.1  # correlation of the noise of two pixels above which they are not taken for independent
 MIN_SHARE = 0.3  # of the error that a pixel's noise makes typical: windows of few pixels may show none
@@ -139,10 +140,13 @@ def _open_image_denoise(color: Image, albedo: Image | None, normal: Image | None
 def _with_low_frequencies(denoised: Image, noisy: Image, valid: np.ndarray) -> Image:
     """Return a denoised picture, 0 or more, whose low frequencies are those of the noisy one.
 
-    Differences are relative to the picture, so that bright pixels do not spill into dark ones.
+    Differences are relative to the picture, so that bright pixels do not spill into dark ones. What a rare
+    bright sample adds stays out.
     """
     unit = np.maximum(denoised, 0) + np.float32(DARK)
-    missing = np.moveaxis(np.where(valid[..., None], (noisy - denoised) / unit, 0), -1, 0)
+    with np.errstate(over="ignore"):
+        relative = np.where(valid[..., None], np.minimum((noisy - denoised) / unit, OUTLIER), 0)
+    missing = np.moveaxis(relative, -1, 0)
     for _ in range(2):
         missing = window_means(missing, REACH)
     return np.maximum(denoised + unit * np.moveaxis(missing, 0, -1), 0)

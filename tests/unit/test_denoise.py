@@ -145,6 +145,15 @@ def test_low_frequencies_are_those_of_the_halves(monkeypatch):
     assert abs(difference[24:72, SIZE // 2 - 8 : SIZE // 2]).max() < 0.1
 
 
+def test_a_rare_bright_sample_stays_where_it_is():
+    """A ten-thousandfold one changes no picture beyond the reach of the denoiser's own kernel."""
+    halves = [noisy(SMOOTH, seed, 0.1) for seed in range(2)]
+    halves[0][48, 48] += 1e4
+    difference = filters.denoise(*halves).image - SMOOTH
+    difference[44:53, 44:53] = 0
+    assert rms(difference) < 0.01
+
+
 def test_no_light_is_negative(monkeypatch):
     """Where a denoiser leaves more light than the halves have, on some pixels only."""
     stripes = np.where(column[..., None] % 2, 0.4, 0) * np.ones(3, np.float32)
