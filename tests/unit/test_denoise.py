@@ -154,6 +154,14 @@ def test_a_rare_bright_sample_stays_where_it_is():
     assert rms(difference) < 0.01
 
 
+def test_invalid_pixels_darken_no_others():
+    """Nor do they brighten them: low frequencies are those of the pixels that are known."""
+    halves = [noisy(SMOOTH, seed, 0.01) for seed in range(2)]
+    halves[0][40:56, 40:56] = np.nan
+    beside = filters.denoise(*halves).image[40:56, 57:62] - SMOOTH[40:56, 57:62]
+    assert abs(beside.mean()) < 0.005
+
+
 def test_no_light_is_negative(monkeypatch):
     """Where a denoiser leaves more light than the halves have, on some pixels only."""
     stripes = np.where(column[..., None] % 2, 0.4, 0) * np.ones(3, np.float32)

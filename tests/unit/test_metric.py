@@ -33,6 +33,12 @@ def test_errors_are_those_that_others_define():
     assert METRICS["display"].rmse(noisy, true) ** 2 == pytest.approx(expected, abs=rounding)
 
 
+def test_a_screen_shows_the_dark_in_proportion():
+    """sRGB is linear up to 0.0031308, and goes on without a step."""
+    dark = np.float32([0, 0.001, 0.003, 0.00314])
+    np.testing.assert_allclose(METRICS["display"].encode(dark), 12.92 * dark, rtol=1e-4)
+
+
 @pytest.mark.parametrize("name", METRICS)
 def test_weights_turn_small_linear_errors_into_those_of_the_metric(name):
     noisy, true = _pair()
