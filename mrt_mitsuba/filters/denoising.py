@@ -100,9 +100,7 @@ def denoise(
     denoised = [_open_image_denoise(half, albedo, normal, quality) for half in inputs]
     if refilter is not None:
         denoised = [refilter(half) for half in denoised]
-    denoised = [
-        _with_low_frequencies(picture, half, valid) for picture, half in zip(denoised, halves, strict=True)
-    ]
+    denoised = [_with_low_frequencies(*pair) for pair in zip(denoised, halves, strict=True)]
     estimates = _Estimates.of(halves, denoised, encode or np.asarray, valid)
     weight = estimates.best_weight()
     share = weight[..., None]
@@ -137,7 +135,7 @@ def _open_image_denoise(color: Image, albedo: Image | None, normal: Image | None
     return np.asarray(pyoidn.denoise(positive, **features, hdr=True, quality=quality))
 
 
-def _with_low_frequencies(denoised: Image, noisy: Image, valid: np.ndarray) -> Image:
+def _with_low_frequencies(denoised: Image, noisy: Image) -> Image:
     """Return a denoised picture, 0 or more, whose low frequencies are those of the noisy one.
 
     Differences are relative to the picture, so that bright pixels do not spill into dark ones. What a rare
@@ -145,8 +143,7 @@ def _with_low_frequencies(denoised: Image, noisy: Image, valid: np.ndarray) -> I
     """
     unit = np.maximum(denoised, 0) + np.float32(DARK)
     with np.errstate(over="ignore"):
-        relative = np.where(valid[..., None], np.minimum((noisy - denoised) / unit, OUTLIER), 0)
-    missing = np.moveaxis(relative, -1, 0)
+        missing = np.moveaxis(np.minimum((noisy - denoised) / unit, OUTLIER), -1, 0)
     for _ in range(2):
         missing = window_means(missing, REACH)
     return np.maximum(denoised + unit * np.moveaxis(missing, 0, -1), 0)
