@@ -14,7 +14,7 @@ import numpy as np
 from mrt_mitsuba.adaptive.estimate import SampleStatistics
 from mrt_mitsuba.filters.denoising import Denoised, denoise
 
-DENOISING_SPP = 20  # cost of denoising the two halves, in samples per pixel
+DENOISING_SPP = 15  # cost of denoising the two halves, in samples per pixel
 EXPECTED_RATIO = 0.4  # of the mixture's error to the plain one, before it is measured
 ERROR_DECAY = 0.75  # power of the plain error with which the error of the mixture falls
 CLOSE_ERROR = 1.1  # times the target: predicted error from which it is measured
