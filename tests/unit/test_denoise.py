@@ -140,8 +140,7 @@ def test_low_frequencies_are_those_of_the_halves(monkeypatch):
     halves = [noisy(HALF_BRIGHT, seed, 0.05) for seed in range(2)]
     halves[0][20, 70] *= 1.5
     difference = filters.denoise(*halves).image - HALF_BRIGHT
-    inside = abs(column[0] - SIZE // 2) > 20
-    assert rms(difference[24:72, inside]) < 0.01
+    assert rms(difference[24:72, 64:80]) < 0.01
     assert abs(difference[24:72, SIZE // 2 - 8 : SIZE // 2]).max() < 0.1
 
 
@@ -152,14 +151,6 @@ def test_a_rare_bright_sample_stays_where_it_is():
     difference = filters.denoise(*halves).image - SMOOTH
     difference[44:53, 44:53] = 0
     assert rms(difference) < 0.01
-
-
-def test_invalid_pixels_darken_no_others():
-    """Nor do they brighten them: low frequencies are those of the pixels that are known."""
-    halves = [noisy(SMOOTH, seed, 0.01) for seed in range(2)]
-    halves[0][40:56, 40:56] = np.nan
-    beside = filters.denoise(*halves).image[40:56, 57:62] - SMOOTH[40:56, 57:62]
-    assert abs(beside.mean()) < 0.005
 
 
 def test_no_light_is_negative(monkeypatch):

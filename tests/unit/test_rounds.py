@@ -97,6 +97,10 @@ def _render(
     )
 
 
+def rms(values: Any) -> float:
+    return float(np.sqrt(np.square(values).mean()))
+
+
 def _pilot_rmse(stats: Any) -> float:
     """The error of the halves' mean, as the variance of pilot rays foresees it."""
     squares = stats.without_border(pilot_estimate(stats).variance / stats.count[:2].sum(0))
@@ -226,25 +230,23 @@ def test_the_variance_of_few_rays_is_that_of_many(rays):
 
 
 @pytest.mark.parametrize("groups", [1, 32])
-def test_a_forecast_is_the_error_of_the_mean_of_both_halves(groups):
-    """Of normal numbers of variance 1, from the first two rays of a pixel on; of 40 pictures of 256 pixels,
-    the root mean square is known to 1 %."""
+def test_pilots_know_the_variance_of_rays(groups):
+    """Of normal numbers of variance 1, from the first two rays of a pixel on; the mean over 40 pictures of
+    256 pixels is known to 2 %."""
 
     def draw(rng: np.random.Generator, pixel: np.ndarray) -> np.ndarray:
         return 5 + rng.normal(size=len(pixel))
 
-    squares = []
+    found = []
     for seed in range(40):
         tracer = Tracer(Draws(draw), seed)  # type: ignore[arg-type]
         first = groups * tracer.initial_allocation
         stats = tracer.trace(tracer.blank("linear"), first, lambda rays: None)
-        squares.append(_pilot_rmse(stats) ** 2)
-    rays = stats.count[:2].sum(0)
-    assert (rays == 4 * groups).all()
-    assert np.mean(squares) ** 0.5 == pytest.approx(rays.mean() ** -0.5, rel=0.08)
+        found.append(pilot_estimate(stats).variance.mean())
+    assert np.mean(found) == pytest.approx(1, rel=0.16)
 
 
-def test_a_filter_makes_a_forecast_less_certain():
+def test_a_filter_makes_an_error_less_certain():
     """By the correlation of pixels: of the same rays, fewer are independent."""
     found = []
     for rfilter in ("box", "gaussian"):
@@ -271,19 +273,14 @@ def test_a_tail_of_few_values_is_pulled_to_a_shape_of_a_half():
     assert tail_shape(values, np.ones(100)) == pytest.approx((20 * 0.1 + 10 * 0.5) / 30, abs=0.05)
 
 
+@pytest.mark.filterwarnings("ignore::mrt_mitsuba.MrtWarning")
 def test_errors_on_a_screen_hold_where_light_is_rare():
-    """A tenth of the rays of a dark picture: the halves alone state two thirds of the squared error. The root
+    """In a tenth of the rays of a dark picture: the difference of the halves alone would be too small. The
     mean square of 40 pictures is known to 2 %; what clipping adds in pictures so small, to a tenth."""
-    metric = METRICS["display"]
-    true = np.full((SIDE, SIDE, 3), 0.02)
-    stated = []
-    errors = []
-    for seed in range(40):
-        tracer = Tracer(Draws(lambda rng, pixel: 0.2 * (rng.random(len(pixel)) < 0.1)), seed)  # type: ignore[arg-type]
-        stats = tracer.trace(tracer.blank("display"), 2 * tracer.initial_allocation, lambda rays: None)
-        stated.append(stats.squared_errors(metric).mean())
-        errors.append(metric.rmse(stats.image(), true) ** 2)
-    assert np.mean(stated) / np.mean(errors) == pytest.approx(1.1, abs=0.15)
+    draws = Draws(lambda rng, pixel: 0.2 * (rng.random(len(pixel)) < 0.1))
+    results = [_render(draws, seed, rays=16, metric="display") for seed in range(40)]
+    errors = [METRICS["display"].rmse(result.image, np.full((SIDE, SIDE, 3), 0.02)) for result in results]
+    assert rms([r.error.rmse for r in results]) / rms(errors) == pytest.approx(1.05, abs=0.1)
 
 
 def test_the_second_round_is_sized_for_rays_that_go_to_noise(monkeypatch):
@@ -313,14 +310,6 @@ def test_errors_of_a_mixture_have_the_curvature_of_the_metric():
         mixture = Denoiser(lambda: (plain, plain)).mixture(stats, plain_error=1.0)  # noqa: B023
         found.append([mixture.rmse, mixture.low, mixture.high, mixture.error.mean()])
     np.testing.assert_allclose(found[1], 2 * np.array(found[0]), rtol=1e-6)
-
-
-def test_no_more_rays_than_allowed_are_spent_where_scouts_met_less_noise():
-    """They take the target for reached, and the halves would take four times the rays."""
-    exposer = Draws(_calm)
-    exposer.draws[2:] = 2 * [lambda rng, pixel: 1 + 0.1 * (_calm(rng, pixel) - 1)]
-    with pytest.warns(mrt.MrtWarning, match="maxspp=35 ends the render"):
-        assert _render(exposer, target=0.05, rays=35).rounds[-1].spp <= 35
 
 
 @pytest.mark.parametrize(("draw", "doubtful"), [(_calm, False), (_rare(0.3), False), (_rare(0.003, 8), True)])
