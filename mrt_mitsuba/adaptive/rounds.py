@@ -197,7 +197,8 @@ def plan_round(
     if caution * now.rmse <= target:
         return None
     gain = allocator.gain if np.ptp(stats.count) else FIRST_GAIN
-    growth = max((caution * now.rmse / target) ** (2 / (1 + gain)), 2 * MIN_GROWTH - 1)
+    excess = min(caution * now.rmse / target, GROWTH**2)  # no power overflows
+    growth = max(excess ** (2 / (1 + gain)), 2 * MIN_GROWTH - 1)
     return _nonempty(allocator, stats, seen, min(most, now.spp * growth), most)
 
 

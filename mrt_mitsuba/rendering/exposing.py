@@ -375,7 +375,7 @@ class Exposer:
             seconds = time.perf_counter() - start
             start += seconds
             if timed:  # a power of two, so that Dr.Jit finds arrays to use again
-                known = round(math.log2(max(some.rays * WAVEFRONT_SECONDS / seconds, 1)))
+                known = round(math.log2(max(some.rays * WAVEFRONT_SECONDS / max(seconds, 1e-9), 1)))
                 self._wavefront = min(max(2**known, WAVEFRONT), most)
 
     def _one_by_one(self, groups: RayBatch, samples: Samples) -> tuple[np.ndarray, Values]:
