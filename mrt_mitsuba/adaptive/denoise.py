@@ -43,9 +43,7 @@ class Denoiser:
         if self._known is None:
             self._known = self.features()
         unknown = stats.unknown()[..., None]
-        halves = [
-            np.where(unknown, np.nan, stats.film.picture(half[..., :3])) for half in stats.halves.pictures()
-        ]
+        halves = [np.where(unknown, np.nan, half) for half in stats.half_pictures]
         albedo, normal = self._known
         unfiltered = None
         if stats.film.reach:

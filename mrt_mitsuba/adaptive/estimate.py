@@ -157,9 +157,9 @@ class SampleStatistics:
     def half_pictures(self) -> tuple[np.ndarray, np.ndarray]:
         """Colours of the half buffers, [H, W, 3], without the border; 0 where they are invalid."""
         first, second = self.halves.pictures()
-        return self._valid(first), self._valid(second)
+        return self._masked(first), self._masked(second)
 
-    def _valid(self, picture: np.ndarray) -> np.ndarray:
+    def _masked(self, picture: np.ndarray) -> np.ndarray:
         """Colours [H, W, 3] of a picture with the border, without it; 0 where they are invalid."""
         return np.where(self.unknown()[..., None], 0, self.film.picture(picture[..., :3]))
 
@@ -196,7 +196,7 @@ class SampleStatistics:
             pilots = np.moveaxis(self.sum[:, PILOTS] / np.float32(self.count[PILOTS]), 0, -1)
         else:
             pilots = self.pilots.pictures()
-        first, second = (self._valid(picture) for picture in pilots)
+        first, second = (self._masked(picture) for picture in pilots)
         halves = self.half_pictures
         found = 4 * metric.squared_errors((first + second) / 2, (halves[0] + halves[1]) / 2).mean()
         found -= self._squared_errors.mean()

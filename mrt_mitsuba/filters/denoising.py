@@ -79,7 +79,8 @@ def denoise(
         refilter: what the reconstruction filter makes of pixel means; for ``unfiltered`` ones, denoised.
         quality: of Open Image Denoise; "fast" takes half the time of "balanced", and loses fine detail.
 
-    Pixels that are not finite in a render are taken from the mean as they are, and count in no error.
+    Low frequencies, in which noise is small, stay those of the renders. Pixels that are not finite in a
+    render are taken from the mean as they are, and count in no error.
 
     Raises:
         UsageError: for pictures of different shapes, or of another shape than [H, W, 3].
